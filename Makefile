@@ -1,0 +1,19 @@
+# Every target sets up .venv by itself; a second call starts at once.
+.PHONY: demo test check clean
+
+demo: .venv/installed
+	.venv/bin/pf2mp-demo --output_dir=demo
+
+test: .venv/installed
+	.venv/bin/python -m pytest
+
+check: .venv/installed
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+	.venv/bin/mypy
+
+clean:
+	rm -rf .venv demo build *.egg-info
+
+.venv/installed: pyproject.toml constraints.txt
+	@.ci/set_up

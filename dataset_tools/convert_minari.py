@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reads PointMaze datasets of Minari (https://minari.farama.org/datasets/D4RL/pointmaze/) from a local folder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from lerobot_pf2mp.dataset_tools.episodes import Trajectory
+
+
+def read_minari(path: Path) -> tuple[int, Iterator[Trajectory]]:
+    """The trajectories of a Minari PointMaze dataset, whose coordinates are this package's own.
+
+    Args:
+        path: The dataset's folder, for example ``~/.minari/datasets/D4RL/pointmaze/large-v2``.
+
+    Returns:
+        Their number, and the trajectories.
+
+    Raises:
+        FileNotFoundError: If there is no such folder.
+        ValueError: If it does not hold a Minari dataset of PointMaze.
+    """
+    import minari
+
+    data = Path(path).expanduser()
+    data = data / "data" if (data / "data").is_dir() else data
+    if not data.is_dir():
+        raise FileNotFoundError(
+            f"source.path must be the folder of a Minari dataset, got {path}, which does not exist"
+        )
+    try:
+        dataset = minari.MinariDataset(data)
+    except Exception as error:  # the storage formats raise a dozen types
+        raise ValueError(
+            f"{path} must hold a Minari dataset, got one that cannot be read: {error}"
+        ) from error
+    return dataset.total_episodes, _trajectories(dataset, path)
+
+
+def _trajectories(dataset: object, path: Path) -> Iterator[Trajectory]:
+    for episode in dataset.iterate_episodes():  # type: ignore[attr-defined]
+        observations = episode.observations
+        if not isinstance(observations, dict) or not {"achieved_goal", "desired_goal"} <= set(observations):
+            raise ValueError(
+                f"{path} must hold PointMaze episodes with achieved_goal and desired_goal, got {observations!r:.80}"
+            )
+        positions = np.asarray(observations["achieved_goal"], dtype=np.float64)
+        goals = np.asarray(observations["desired_goal"], dtype=np.float64)
+        # The first desired goal is the previous episode's: PointMaze draws the new one after it is recorded.
+        yield Trajectory(positions, goals[min(1, len(goals) - 1)])

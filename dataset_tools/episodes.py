@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Start-goal episodes of positions, resampled to a fixed number of steps."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+MIN_STEPS = 2
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """The way from a start to a goal.
+
+    Args:
+        positions: ``(N + 1, D)`` positions at equal time intervals [m].
+        goal: ``(D,)`` where it was meant to end [m].
+    """
+
+    positions: np.ndarray
+    goal: np.ndarray
+
+    @property
+    def n_steps(self) -> int:
+        """The number N of steps."""
+        return len(self.positions) - 1
+
+
+def resample(positions: np.ndarray, n_steps: int) -> np.ndarray:
+    """The same way in another number of steps, by linear interpolation in time.
+
+    Args:
+        positions: ``(N + 1, D)`` positions at equal time intervals.
+        n_steps: The wanted number of steps T.
+
+    Returns:
+        ``(T + 1, D)`` positions; the first and the last are the given ones.
+    """
+    at = np.linspace(0, len(positions) - 1, n_steps + 1)
+    before = np.minimum(at.astype(int), len(positions) - 2)
+    share = (at - before)[:, None]
+    return (1 - share) * positions[before] + share * positions[before + 1]
+
+
+def prepare(
+    trajectories: Iterable[Trajectory],
+    n_steps: int,
+    collides: Callable[[np.ndarray], bool],
+    dropped: Counter[str],
+) -> Iterator[dict[str, np.ndarray]]:
+    """The frames of all usable trajectories: position and goal observed, next position as action.
+
+    Args:
+        trajectories: Recorded trajectories.
+        n_steps: Steps that each is resampled to.
+        collides: Whether a ``(T + 1, D)`` way touches an obstacle.
+        dropped: Counts the trajectories left out, by reason.
+
+    Yields:
+        For each trajectory ``{"observation.state", "observation.environment_state", "action"}``, each ``(T, D)``
+        float32 [m].
+
+    Raises:
+        ValueError: If a trajectory is not finite.
+    """
+    for number, trajectory in enumerate(trajectories):
+        if not (np.isfinite(trajectory.positions).all() and np.isfinite(trajectory.goal).all()):
+            raise ValueError(f"positions and goals must be finite, got NaN or infinity in episode {number}")
+        if trajectory.n_steps < MIN_STEPS:
+            dropped[f"shorter than {MIN_STEPS} steps"] += 1
+            continue
+        way = resample(trajectory.positions, n_steps)
+        if collides(way):
+            dropped["in collision"] += 1
+            continue
+        yield {
+            "observation.state": way[:-1].astype(np.float32),
+            "observation.environment_state": np.tile(trajectory.goal, (n_steps, 1)).astype(np.float32),
+            "action": way[1:].astype(np.float32),
+        }

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What all maze datasets have in common: features, card, collision test, progress bar."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from lerobot_pf2mp.dataset_tools.episodes import Trajectory, prepare
+from lerobot_pf2mp.dataset_tools.lerobot_writer import DatasetSpec, write_dataset
+from lerobot_pf2mp.envs.maze import BALL_RADIUS, SweptBall, make_point_maze
+
+FPS = 10
+TASK_DESCRIPTION = "Move the ball to the red goal without touching a wall."
+MAZE_OF_TASK = {"maze_umaze": "umaze", "maze_medium": "medium", "maze_large": "large"}
+
+_FEATURES = {
+    "observation.state": {"dtype": "float32", "shape": (2,), "names": ["x", "y"]},
+    "observation.environment_state": {"dtype": "float32", "shape": (2,), "names": ["goal_x", "goal_y"]},
+    "action": {"dtype": "float32", "shape": (2,), "names": ["x", "y"]},
+}
+
+_CARD = """\
+---
+license: apache-2.0
+task_categories: [robotics]
+tags: [LeRobot, pf2mp, maze]
+---
+# {title}
+
+Start-goal trajectories of a ball in a maze, none of which touches a wall. {origin}
+
+Every trajectory is resampled to {n_steps} steps by linear interpolation in time; {fps} fps is nominal.
+
+| feature | meaning | unit |
+|---|---|---|
+| `observation.state` | position x, y of the ball | m |
+| `observation.environment_state` | position x, y of the goal | m |
+| `action` | next position x, y of the ball | m |
+
+The origin is the centre of the map, x points east and y north; cells have sides of 1 m, the ball a radius of 0.1 m.
+Made with [lerobot_policy_pf2mp](https://pypi.org/project/lerobot_policy_pf2mp/).
+"""
+
+
+def maze_of(task: str, maze_map: str | None) -> str:
+    """The maze of a task, or a map given instead of it.
+
+    Raises:
+        ValueError: If there is no such task.
+    """
+    if maze_map is not None:
+        return maze_map
+    if task not in MAZE_OF_TASK:
+        raise ValueError(f"task must be one of {list(MAZE_OF_TASK)}, got {task!r}")
+    return MAZE_OF_TASK[task]
+
+
+def write_maze_dataset(
+    trajectories: Iterable[Trajectory],
+    *,
+    root: Path,
+    repo_id: str,
+    maze: str,
+    origin: str,
+    n_steps: int,
+    n_episodes: int | None = None,
+    n_expected: int | None = None,
+    overwrite: bool = False,
+) -> tuple[int, Counter[str]]:
+    """Writes the usable ones of some trajectories as a LeRobotDataset.
+
+    Args:
+        trajectories: The trajectories, in the coordinates of the environment [m].
+        root: The dataset's folder.
+        repo_id: Its name, ``user/name``.
+        maze: As for `parse_maze_map`; trajectories that touch its walls are left out.
+        origin: A sentence for the card: where the trajectories come from.
+        n_steps: Steps that each is resampled to.
+        n_episodes: Most episodes to write; None writes all.
+        n_expected: Number of trajectories, for the progress bar, if it is known.
+        overwrite: Whether a dataset already there is replaced.
+
+    Returns:
+        The number of episodes written, and the number of those left out, by reason.
+
+    Raises:
+        ValueError: If an argument breaks its rule or no trajectory is usable.
+        FileExistsError: If `root` exists and `overwrite` is false.
+    """
+    if n_steps < 2:
+        raise ValueError(f"n_steps must be at least 2, got {n_steps}")
+    if n_episodes is not None and n_episodes < 1:
+        raise ValueError(f"n_episodes must be at least 1, got {n_episodes}")
+    _, spec = make_point_maze(maze)
+    ball = SweptBall(spec, BALL_RADIUS)
+    dropped: Counter[str] = Counter()
+    card = _CARD.format(title=repo_id, origin=origin, n_steps=n_steps, fps=FPS)
+    n_written = write_dataset(
+        root,
+        DatasetSpec(repo_id, FPS, _FEATURES, TASK_DESCRIPTION, card),
+        _with_progress(
+            islice(prepare(trajectories, n_steps, ball.collides, dropped), n_episodes),
+            n_episodes or n_expected,
+        ),
+        overwrite=overwrite,
+    )
+    return n_written, dropped
+
+
+def _with_progress(
+    episodes: Iterable[dict[str, np.ndarray]], total: int | None
+) -> Iterator[dict[str, np.ndarray]]:
+    yield from tqdm(episodes, total=total, desc="Writing", unit="episode", mininterval=1.0)

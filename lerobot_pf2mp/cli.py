@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The commands: each parses its options, calls one function and says in one line what came out."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import draccus
+
+INTERRUPTED = 130  # the shell's exit code for Ctrl-C
+
+
+@dataclass
+class CollectConfig:
+    """Makes demonstrations in a simulated environment and writes them as a LeRobotDataset.
+
+    Examples:
+        pf2mp-collect --task=maze_large --root=data/maze_large
+        pf2mp-collect --task=maze_medium --n_episodes=500 --action_noise=0.5 --seed=1 --root=data/noisy
+        pf2mp-collect --maze_map=1111111/1000001/1011101/1000001/1111111 --root=data/ring
+    """
+
+    # What to demonstrate: maze_umaze, maze_medium or maze_large.
+    task: str = "maze_large"
+    # Folder of the dataset; by default where LeRobot keeps the datasets of your Hub account.
+    root: Path | None = None
+    # Name of the dataset, user/name; by default local/TASK.
+    repo_id: str | None = None
+    # Demonstrations to write.
+    n_episodes: int = 4000
+    # Steps that each demonstration is resampled to.
+    n_steps: int = 80
+    # Standard deviation of the noise on the expert's force, of which 1 is the largest (100 N).
+    action_noise: float = 0.0
+    # A map of your own instead of the task's: rows of 0 (free) and 1 (wall) separated by "/".
+    maze_map: str | None = None
+    # Seed of everything random.
+    seed: int = 0
+    # Whether to replace a dataset that is already there.
+    overwrite: bool = False
+
+
+@dataclass
+class SourceConfig:
+    """Where recorded demonstrations come from."""
+
+    # Layout of the recording: d4rl (maze2d, one HDF5 file) or minari (pointmaze, a folder).
+    type: str = "d4rl"
+    # The file or folder.
+    path: Path | None = None
+
+
+@dataclass
+class ConvertConfig:
+    """Turns recorded demonstrations into a LeRobotDataset.
+
+    Examples:
+        pf2mp-convert --source.type=d4rl --source.path=maze2d-large-sparse-v1.hdf5 --task=maze_large --root=data/d4rl
+        pf2mp-convert --source.type=minari --source.path=~/.minari/datasets/D4RL/pointmaze/medium-v2 \
+--task=maze_medium --root=data/minari
+    """
+
+    # The recording.
+    source: SourceConfig = field(default_factory=SourceConfig)
+    # What was recorded: maze_umaze, maze_medium or maze_large. Episodes that touch its walls are left out.
+    task: str = "maze_large"
+    # Folder of the dataset; by default where LeRobot keeps the datasets of your Hub account.
+    root: Path | None = None
+    # Name of the dataset, user/name; by default local/TASK.
+    repo_id: str | None = None
+    # Most episodes to write; all by default.
+    n_episodes: int | None = None
+    # Steps that each episode is resampled to.
+    n_steps: int = 80
+    # A map of your own instead of the task's: rows of 0 (free) and 1 (wall) separated by "/".
+    maze_map: str | None = None
+    # Whether to replace a dataset that is already there.
+    overwrite: bool = False
+
+
+@dataclass
+class DemoConfig:
+    """Runs the main job: demonstrations, training, evaluation with guidance off and on, a table and a figure.
+
+    Stages that are done are skipped, so that the command can be interrupted and called again.
+
+    Examples:
+        pf2mp-demo --output_dir=demo
+        pf2mp-demo --output_dir=demo_medium --task=maze_medium --steps=1000
+    """
+
+    # Folder of everything the demo writes.
+    output_dir: Path = Path("demo")
+    # maze_umaze, maze_medium or maze_large.
+    task: str = "maze_large"
+    # Demonstrations.
+    n_demonstrations: int = 4000
+    # Training steps of 64 trajectories.
+    steps: int = 2500
+    # Evaluation episodes for each policy.
+    n_episodes: int = 500
+    # Seed of demonstrations, training and evaluation.
+    seed: int = 0
+
+
+def collect() -> None:
+    """The command pf2mp-collect."""
+    _run(CollectConfig, _collect)
+
+
+def convert() -> None:
+    """The command pf2mp-convert."""
+    _run(ConvertConfig, _convert)
+
+
+def demo() -> None:
+    """The command pf2mp-demo."""
+    _run(DemoConfig, _demo)
+
+
+def train() -> None:
+    """The command pf2mp-train: lerobot-train with low-dimensional datasets kept in memory."""
+    from lerobot_pf2mp.train import main
+
+    main()
+
+
+def _collect(config: CollectConfig) -> None:
+    from lerobot_pf2mp.dataset_tools.collect_maze import collect_maze
+    from lerobot_pf2mp.dataset_tools.maze_dataset import maze_of
+
+    repo_id, root = _dataset_place(config)
+    n_written, dropped = collect_maze(
+        maze_of(config.task, config.maze_map),
+        root=root,
+        repo_id=repo_id,
+        n_episodes=config.n_episodes,
+        n_steps=config.n_steps,
+        action_noise=config.action_noise,
+        seed=config.seed,
+        overwrite=config.overwrite,
+    )
+    _report(n_written, config.n_steps, dropped, root)
+
+
+def _convert(config: ConvertConfig) -> None:
+    from lerobot_pf2mp.dataset_tools.convert_d4rl import read_d4rl
+    from lerobot_pf2mp.dataset_tools.convert_minari import read_minari
+    from lerobot_pf2mp.dataset_tools.maze_dataset import maze_of, write_maze_dataset
+
+    source = config.source
+    if source.path is None:
+        raise ValueError("--source.path must name the recording, got none")
+    maze = maze_of(config.task, config.maze_map)
+    if source.type == "d4rl":
+        trajectories: Any = read_d4rl(source.path, maze)
+        n_expected = len(trajectories)
+    elif source.type == "minari":
+        n_expected, trajectories = read_minari(source.path)
+    else:
+        raise ValueError(f"--source.type must be one of ['d4rl', 'minari'], got {source.type!r}")
+    repo_id, root = _dataset_place(config)
+    n_written, dropped = write_maze_dataset(
+        trajectories,
+        root=root,
+        repo_id=repo_id,
+        maze=maze,
+        origin=f"Converted from {source.path.name} ({source.type}).",
+        n_steps=config.n_steps,
+        n_episodes=config.n_episodes,
+        n_expected=n_expected,
+        overwrite=config.overwrite,
+    )
+    _report(n_written, config.n_steps, dropped, root)
+
+
+def _demo(config: DemoConfig) -> None:
+    from lerobot_pf2mp.demo import run_demo
+
+    run_demo(
+        config.output_dir,
+        task=config.task,
+        n_demonstrations=config.n_demonstrations,
+        steps=config.steps,
+        n_episodes=config.n_episodes,
+        seed=config.seed,
+    )
+
+
+def _dataset_place(config: CollectConfig | ConvertConfig) -> tuple[str, Path]:
+    from lerobot.utils.constants import HF_LEROBOT_HOME
+
+    repo_id = config.repo_id or f"local/{'maze' if config.maze_map else config.task}"
+    return repo_id, config.root or HF_LEROBOT_HOME / repo_id
+
+
+def _report(n_episodes: int, n_steps: int, dropped: Counter[str], root: Path) -> None:
+    left_out = ", ".join(f"{count} {reason}" for reason, count in dropped.items()) or "none"
+    print(f"Wrote {n_episodes} episodes of {n_steps} steps to {root} (left out: {left_out}).")
+
+
+def _run(config_class: type, main: Callable[[Any], None]) -> None:
+    """Parses the command line and runs a command; whatever a user can cause ends in one line and a non-zero code."""
+    # LeRobot's lengthy warning about a video decoder that these commands do not use.
+    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
+    try:
+        main(draccus.parse(config_class))
+    except KeyboardInterrupt:
+        print("interrupted: nothing half-written was left behind", file=sys.stderr)
+        sys.exit(INTERRUPTED)
+    except (draccus.utils.DecodingError, draccus.utils.ParsingError, ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)

@@ -1,0 +1,19 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gymnasium environments that report collisions, and their LeRobot configurations.
+
+Importing this module registers them under ``lerobot_pf2mp/<task>``; MuJoCo is imported when one is made.
+"""
+
+import gymnasium as gym
+
+from lerobot_pf2mp.envs.configs import MAZE_TASKS, PF2MPMazeEnv
+
+for _task, _maze in MAZE_TASKS.items():
+    gym.register(
+        id=f"lerobot_pf2mp/{_task}",
+        entry_point="lerobot_pf2mp.envs.maze:MazeEnv",
+        max_episode_steps=80,
+        kwargs={"maze_map": _maze},
+    )
+
+__all__ = ["MAZE_TASKS", "PF2MPMazeEnv"]
