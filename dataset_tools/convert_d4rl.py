@@ -3,13 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import h5py
 import numpy as np
-
 from lerobot_pf2mp.dataset_tools.episodes import Trajectory
+
 from lerobot_pf2mp.envs.maze import parse_maze_map
 
 # In D4RL's model the walls of cell (i, j) are centred at (i + 1, j + 1) and the ball's joints start at (1.2, 1.2).

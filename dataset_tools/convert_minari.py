@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-
 from lerobot_pf2mp.dataset_tools.episodes import Trajectory
 
 

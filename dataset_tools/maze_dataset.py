@@ -9,10 +9,10 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
-
 from lerobot_pf2mp.dataset_tools.episodes import Trajectory, prepare
 from lerobot_pf2mp.dataset_tools.lerobot_writer import DatasetSpec, write_dataset
+from tqdm import tqdm
+
 from lerobot_pf2mp.envs.maze import BALL_RADIUS, SweptBall, make_point_maze
 
 FPS = 10
