@@ -214,6 +214,12 @@ def _run(config_class: type, main: Callable[[Any], None]) -> None:
     except KeyboardInterrupt:
         print("interrupted: nothing half-written was left behind", file=sys.stderr)
         sys.exit(INTERRUPTED)
-    except (draccus.utils.DecodingError, draccus.utils.ParsingError, ValueError, OSError) as error:
+    except (
+        draccus.utils.DecodingError,
+        draccus.utils.ParsingError,
+        ValueError,
+        RuntimeError,
+        OSError,
+    ) as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(1)

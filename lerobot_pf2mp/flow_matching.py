@@ -33,9 +33,10 @@ class PathSample:
 
 
 class Guide(Protocol):
-    """Bends one integration step: takes ``x_t``, the unguided ``x_{t+dt}`` and dt, returns the guided ``x_{t+dt}``."""
+    """Bends one integration step."""
 
-    def __call__(self, x_t: Tensor, x_next: Tensor, dt: float) -> Tensor: ...
+    def __call__(self, x_t: Tensor, x_next: Tensor, dt: float) -> Tensor:
+        """The guided x_{t+dt}, from x_t and the unguided x_{t+dt}, all ``(B, ...)``."""
 
 
 def sample_path(x_0: Tensor, x_1: Tensor, t: Tensor) -> PathSample:

@@ -134,14 +134,18 @@ class PotentialField:
             ``(..., D)`` offsets [normalised]; d(a, H) is their norm.
         """
         queries = self._flatten(a)
-        offsets = []
-        for block in self._blocks(queries):
-            log_kernels = self._log_kernels(block)
-            is_safe = _log_sum_exp(log_kernels) - self._log_normaliser > self.log_threshold
-            nearest = log_kernels.masked_fill(~self._anchor_is_safe, -math.inf).argmax(dim=-1)
-            offset = self._centred[nearest] - (block - self._centre)
-            offsets.append(offset.masked_fill(is_safe.unsqueeze(-1), 0.0))
-        return torch.cat(offsets).reshape(a.shape)
+        offsets = torch.zeros_like(queries)
+        is_unsafe = self.log_density(queries) <= self.log_threshold
+        # Few actions are unsafe, least of all guided ones: only for them the nearest safe anchor is looked up.
+        unsafe = queries[is_unsafe]
+        if len(unsafe):
+            safe_anchors = self._centred[self._anchor_is_safe]
+            nearest = [
+                safe_anchors[_log_kernels(block - self._centre, safe_anchors, self.bandwidth).argmax(dim=-1)]
+                for block in self._blocks(unsafe)
+            ]
+            offsets[is_unsafe] = torch.cat(nearest) - (unsafe - self._centre)
+        return offsets.reshape(a.shape)
 
     def potential(self, a: Tensor) -> Tensor:
         """The potential phi(a) = log p(a) + alpha d(a, H); larger is safer.

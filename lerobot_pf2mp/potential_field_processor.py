@@ -45,7 +45,7 @@ class FieldSettings:
     action_dims: tuple[int, ...] | None = None
     bandwidth: float | str = "likelihood"
     threshold_quantile: float = 0.01
-    alpha: float = 0.0
+    alpha: float = -0.1
 
     def __post_init__(self) -> None:
         if self.n_points < 1:

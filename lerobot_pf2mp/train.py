@@ -85,3 +85,7 @@ def _take_memory_limit() -> float:
         if not limit >= 0:
             raise ValueError(f"{MEMORY_LIMIT_OPTION} must be at least 0 [GB], got {limit:g}")
     return limit
+
+
+if __name__ == "__main__":
+    main()

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -158,7 +159,7 @@ class SweptBall:
 
     def path_clearance(self, path: np.ndarray) -> float:
         """The smallest clearance along a polyline ``(N, 2)`` of positions [m], N >= 2."""
-        return min(self.clearance(start, end) for start, end in zip(path[:-1], path[1:], strict=True))
+        return min(self.clearance(start, end) for start, end in pairwise(path))
 
     def _place(self, start: np.ndarray, end: np.ndarray) -> None:
         step = end - start

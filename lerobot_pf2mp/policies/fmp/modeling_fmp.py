@@ -135,6 +135,7 @@ class FMPPolicy(PreTrainedPolicy):
                 `n_obs_steps` > 1.
             noise: ``(B, horizon, action_dim)`` prior sample x_0; drawn from N(0, I) if None.
             generator: Source of randomness for that draw.
+            **kwargs: Ignored, for callers that pass other policies' options.
         """
         network = self.inference_network
         condition = network.encoder(self._observation_window(batch))
@@ -167,6 +168,7 @@ class FMPPolicy(PreTrainedPolicy):
             batch: Normalised observations of the current step, ``(B, ...)``.
             noise: Prior sample for the next prediction, as for `predict_action_chunk`.
             generator: Source of randomness for the next prediction.
+            **kwargs: Ignored, as in `predict_action_chunk`.
         """
         observation = {key: value for key, value in batch.items() if key != ACTION}
         if self.config.image_features:

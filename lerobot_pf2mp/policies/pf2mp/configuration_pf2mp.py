@@ -39,7 +39,7 @@ class PF2MPConfig(FMPConfig):
     field_action_dims: tuple[int, ...] | None = None
     field_bandwidth: float | str = "likelihood"
     field_threshold_quantile: float = 0.01
-    field_alpha: float = 0.0
+    field_alpha: float = -0.1
 
     def __post_init__(self) -> None:
         """Validates the values.

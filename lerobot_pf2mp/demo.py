@@ -1,0 +1,293 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The main job from end to end: demonstrations, training, evaluation without and with guidance, table and figure."""
+
+from __future__ import annotations
+
+import json
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from contextlib import nullcontext
+from importlib.metadata import version
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from lerobot_pf2mp.dataset_tools.collect_maze import collect_maze
+from lerobot_pf2mp.dataset_tools.maze_dataset import maze_of
+from lerobot_pf2mp.envs import MAZE_TASKS
+from lerobot_pf2mp.envs.maze import BALL_RADIUS, SweptBall, make_point_maze
+from lerobot_pf2mp.loading import load_policy
+from lerobot_pf2mp.plots import MazePath, plot_maze_overview
+from lerobot_pf2mp.statistics import Rate
+
+_MODULES = {
+    "pf2mp-train": "lerobot_pf2mp.train",
+    "lerobot-eval": "lerobot.scripts.lerobot_eval",
+}
+_N_FIGURE_EPISODES = 200
+
+
+def run_demo(
+    output_dir: Path, *, task: str, n_demonstrations: int, steps: int, n_episodes: int, seed: int
+) -> None:
+    """Runs all stages that are not done yet and prints the result.
+
+    Args:
+        output_dir: Folder of everything that is written.
+        task: maze_umaze, maze_medium or maze_large.
+        n_demonstrations: Demonstrations to collect.
+        steps: Training steps.
+        n_episodes: Evaluation episodes for each policy.
+        seed: Seed of demonstrations, training and evaluation.
+
+    Raises:
+        ValueError: If an argument breaks its rule, or the folder holds a demo with other options.
+        RuntimeError: If a command fails.
+    """
+    maze = maze_of(task, None)
+    for name, value in (
+        ("n_demonstrations", n_demonstrations),
+        ("steps", steps),
+        ("n_episodes", n_episodes),
+    ):
+        if value < 1:
+            raise ValueError(f"{name} must be at least 1, got {value}")
+    options = {
+        "task": task,
+        "n_demonstrations": n_demonstrations,
+        "steps": steps,
+        "n_episodes": n_episodes,
+        "seed": seed,
+    }
+    _claim(output_dir, options)
+    began = time.monotonic()
+    data, checkpoint = output_dir / "demonstrations", output_dir / "train/checkpoints/last/pretrained_model"
+
+    _say(1, f"Demonstrations: {n_demonstrations} trajectories of a scripted expert in the MuJoCo maze")
+    if data.exists():
+        print("done already")
+    else:
+        n_written, dropped = collect_maze(
+            maze,
+            root=data,
+            repo_id=f"local/{task}",
+            n_episodes=n_demonstrations,
+            n_steps=80,
+            action_noise=0.0,
+            seed=seed,
+            overwrite=False,
+        )
+        print(f"{n_written} collision-free trajectories ({dropped.total()} left out)")
+
+    _say(2, f"Training: a small network, {steps} steps; the potential field is fitted on the way")
+    _train(task, data, output_dir / "train", steps, seed)
+
+    rates = {}
+    for stage, (policy, scale) in enumerate((("fmp", "0"), ("pf2mp", None)), start=3):
+        name = "PF2MP: the same weights with guidance" if policy == "pf2mp" else "FMP: guidance off"
+        _say(stage, f"Evaluation of {name}, {n_episodes} episodes")
+        rates[policy] = _evaluate(task, checkpoint, output_dir / f"eval_{policy}", n_episodes, seed, scale)
+
+    _say(5, "Figure and table")
+    figure = output_dir / "overview.png"
+    if not figure.exists():
+        _plot(checkpoint, maze, figure, seed)
+    table = _table(rates)
+    (output_dir / "results.md").write_text(table, encoding="utf-8")
+    _write_csv(output_dir / "results.csv", rates, options)
+    print(f"\n{table}\nFigure: {figure}\nTable: {output_dir / 'results.md'}")
+    print(f"Time: {(time.monotonic() - began) / 60:.1f} minutes")
+
+
+def _claim(output_dir: Path, options: dict[str, object]) -> None:
+    """Marks the folder as a demo with these options, so that a second call resumes the same one."""
+    mark = output_dir / "demo.json"
+    if mark.exists():
+        found = json.loads(mark.read_text(encoding="utf-8"))
+        if found != options:
+            raise ValueError(
+                f"{output_dir} holds a demo with other options ({found}), got {options}: choose another --output_dir"
+            )
+    elif output_dir.exists() and any(output_dir.iterdir()):
+        raise ValueError(f"--output_dir must be new, empty or a demo's, got {output_dir}")
+    else:
+        output_dir.mkdir(parents=True, exist_ok=True)
+        mark.write_text(json.dumps(options, indent=2), encoding="utf-8")
+
+
+def _train(task: str, data: Path, output_dir: Path, steps: int, seed: int) -> None:
+    last = output_dir / "checkpoints/last"
+    done = (
+        json.loads((last / "training_state/training_step.json").read_text())["step"] if last.exists() else 0
+    )
+    if done >= steps:
+        print("done already")
+        return
+    if done:
+        _run(
+            "pf2mp-train",
+            f"--config_path={last / 'pretrained_model/train_config.json'}",
+            "--resume=true",
+            equivalent="lerobot-train",
+        )
+        return
+    shutil.rmtree(output_dir, ignore_errors=True)  # a run that was interrupted before its first checkpoint
+    _run(
+        "pf2mp-train",
+        f"--dataset.repo_id=local/{task}",
+        f"--dataset.root={data}",
+        "--policy.type=pf2mp",
+        "--policy.push_to_hub=false",
+        "--policy.device=cpu",
+        "--policy.horizon=80",
+        "--policy.n_action_steps=80",
+        "--policy.drop_n_last_frames=79",
+        "--policy.down_dims=[32,64,128]",
+        "--batch_size=64",
+        f"--steps={steps}",
+        "--save_freq=500",
+        "--log_freq=100",
+        f"--seed={seed}",
+        f"--output_dir={output_dir}",
+        equivalent="lerobot-train",
+    )
+
+
+def _evaluate(
+    task: str, checkpoint: Path, output_dir: Path, n_episodes: int, seed: int, guidance_scale: str | None
+) -> dict[str, Rate]:
+    result = output_dir / "eval_info.json"
+    if result.exists():
+        print("done already")
+    else:
+        shutil.rmtree(output_dir, ignore_errors=True)
+        env_task = {maze: name for name, maze in MAZE_TASKS.items()}[maze_of(task, None)]
+        _run(
+            "lerobot-eval",
+            f"--policy.path={checkpoint}",
+            *([] if guidance_scale is None else [f"--policy.guidance_scale={guidance_scale}"]),
+            "--env.type=pf2mp_maze",
+            f"--env.task={env_task}",
+            f"--eval.n_episodes={n_episodes}",
+            f"--eval.batch_size={min(n_episodes, 50)}",
+            "--eval.use_async_envs=false",
+            f"--seed={seed}",
+            f"--output_dir={output_dir}",
+            log=output_dir.with_suffix(".log"),
+        )
+    metrics = json.loads(result.read_text())["per_task"][0]["metrics"]
+    return {
+        "collision": Rate(sum(reward < 0 for reward in metrics["sum_rewards"]), n_episodes),
+        "success": Rate(sum(metrics["successes"]), n_episodes),
+    }
+
+
+def _run(command: str, *options: str, equivalent: str | None = None, log: Path | None = None) -> None:
+    """Shows a command of LeRobot or of this package and runs it in a process of its own, its output into `log` if given."""
+    print(f"$ {command} {shlex.join(options)}")
+    if equivalent is not None:
+        print(f"  (the same with LeRobot's own loader, slower: {equivalent} with these options)")
+    sys.stdout.flush()
+    with log.open("wb") if log else nullcontext() as output:
+        finished = subprocess.run(
+            [sys.executable, "-m", _MODULES[command], *options], check=False, stdout=output, stderr=output
+        )
+    if finished.returncode != 0:
+        where = f"see {log}" if log else "its output is above"
+        raise RuntimeError(f"{command} failed with exit code {finished.returncode}; {where}")
+
+
+def _plot(checkpoint: Path, maze: str, output: Path, seed: int) -> None:
+    """Draws Figure 3 for an episode in which FMP collides and PF2MP, from the same start and noise, does not."""
+    env, spec = make_point_maze(maze)
+    ball = SweptBall(spec, BALL_RADIUS)
+    policy, preprocess, postprocess = load_policy(checkpoint, device="cpu")
+    starts, goals = [], []
+    for episode in range(_N_FIGURE_EPISODES):
+        observation, _ = env.reset(seed=seed + episode)
+        starts.append(observation["achieved_goal"])
+        goals.append(observation["desired_goal"])
+    env.close()
+    batch = preprocess(
+        {
+            "observation.state": torch.tensor(np.array(starts), dtype=torch.float32),
+            "observation.environment_state": torch.tensor(np.array(goals), dtype=torch.float32),
+        }
+    )
+    noise = torch.randn(len(starts), policy.config.horizon, 2, generator=torch.Generator().manual_seed(seed))
+    guided = postprocess(policy.predict_action_chunk(batch, noise=noise)).numpy()
+    scale, policy.config.guidance_scale = policy.config.guidance_scale, 0.0
+    unguided = postprocess(policy.predict_action_chunk(batch, noise=noise)).numpy()
+    policy.config.guidance_scale = scale
+
+    ways = [
+        [_way(ball, start, chunk) for start, chunk in zip(starts, c, strict=True)] for c in (unguided, guided)
+    ]
+    # The longest way among those that show the difference; any way if there is none.
+    order = sorted(
+        range(len(starts)),
+        key=lambda i: (
+            bool(ways[0][i].collisions.any()) and not ways[1][i].collisions.any(),
+            np.linalg.norm(np.diff(ways[1][i].positions, axis=0), axis=1).sum(),
+        ),
+    )
+    best = order[-1]
+    plot_maze_overview(
+        output,
+        maze_map=env.maze.maze_map,
+        field=batch["potential_field"].field(policy.config.field_settings),
+        to_metres=postprocess,
+        unguided=ways[0][best],
+        guided=ways[1][best],
+        goal=goals[best],
+    )
+
+
+def _way(ball: SweptBall, start: np.ndarray, chunk: np.ndarray) -> MazePath:
+    positions = np.vstack([start, chunk])
+    return MazePath(positions, np.array([ball.clearance(*pair) < 0 for pair in pairwise(positions)]))
+
+
+def _table(rates: dict[str, dict[str, Rate]]) -> str:
+    lines = [
+        "| policy | collision rate | success rate | episodes |",
+        "|---|---|---|---|",
+    ]
+    for policy, rate in rates.items():
+        lines.append(f"| {policy} | {rate['collision']} | {rate['success']} | {rate['success'].total} |")
+    return "\n".join(lines) + "\n"
+
+
+def _write_csv(path: Path, rates: dict[str, dict[str, Rate]], options: dict[str, object]) -> None:
+    columns = [
+        *options,
+        "policy",
+        "collisions",
+        "successes",
+        "python",
+        "torch",
+        "lerobot",
+        "mujoco",
+        "machine",
+    ]
+    environment = [
+        platform.python_version(),
+        *(version(name) for name in ("torch", "lerobot", "mujoco")),
+        platform.machine(),
+    ]
+    rows = [
+        [*options.values(), policy, rate["collision"].count, rate["success"].count, *environment]
+        for policy, rate in rates.items()
+    ]
+    text = "\n".join(",".join(str(cell) for cell in row) for row in [columns, *rows])
+    path.write_text(f"{text}\n", encoding="utf-8")
+
+
+def _say(stage: int, what: str) -> None:
+    print(f"\n[{stage}/5] {what}", flush=True)

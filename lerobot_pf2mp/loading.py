@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loads a policy with its processors, field included, for notebooks and scripts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import PreTrainedPolicy, make_pre_post_processors
+from lerobot.policies.factory import get_policy_class
+from lerobot.processor import PolicyAction, PolicyProcessorPipeline
+
+
+def load_policy(
+    path: str | Path, *, revision: str | None = None, device: str | None = None, **overrides: Any
+) -> tuple[
+    PreTrainedPolicy,
+    PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
+    PolicyProcessorPipeline[PolicyAction, PolicyAction],
+]:
+    """Loads a checkpoint: the policy in evaluation mode, its preprocessor and its postprocessor.
+
+    Args:
+        path: A checkpoint's ``pretrained_model`` folder, or a repository on the Hub.
+        revision: Branch, tag or commit on the Hub.
+        device: Where to run, for example ``cuda``; None for the best there is.
+        **overrides: Fields of the policy's configuration to change, for example ``guidance_scale=0.4``.
+
+    Returns:
+        The policy, the preprocessor and the postprocessor.
+
+    Raises:
+        FileNotFoundError: If there is neither such a folder nor such a repository.
+    """
+    is_repository_name = len(Path(path).parts) == 2 and not Path(path).is_absolute()
+    if not Path(path).is_dir() and not is_repository_name:
+        raise FileNotFoundError(
+            f"path must be a checkpoint's pretrained_model folder or a repository user/name, got {path}"
+        )
+    options = [f"--{name}={value}" for name, value in overrides.items()]
+    if device is not None:
+        options.append(f"--device={device}")
+    config = PreTrainedConfig.from_pretrained(path, revision=revision, cli_overrides=options)
+    # LeRobot leaves this empty; without it the processors would be built anew, with neither statistics nor field.
+    config.pretrained_path = Path(path)
+    policy = get_policy_class(config.type).from_pretrained(path, config=config, revision=revision)
+    preprocessor, postprocessor = make_pre_post_processors(
+        config,
+        pretrained_path=str(path),
+        pretrained_revision=revision,
+        preprocessor_overrides={"device_processor": {"device": config.device}},
+    )
+    return policy, preprocessor, postprocessor

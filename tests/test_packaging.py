@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The distribution, as built, is found by LeRobot's plug-in discovery."""
+
+import subprocess
+import sys
+import sysconfig
+import tomllib
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[1]
+
+DISCOVER = """
+import importlib.metadata, sys
+from lerobot.utils.import_utils import register_third_party_plugins
+register_third_party_plugins()
+from lerobot.configs import PreTrainedConfig
+from lerobot.envs.configs import EnvConfig
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+import lerobot_pf2mp, gymnasium
+assert "site-packages" in lerobot_pf2mp.__file__ and sys.argv[1] in lerobot_pf2mp.__file__, lerobot_pf2mp.__file__
+for name in ("fmp", "pf2mp"):
+    assert get_policy_class(name).name == name
+    config = PreTrainedConfig.get_choice_class(name)(device="cpu")
+    make_pre_post_processors(config)
+assert "pf2mp_maze" in EnvConfig.get_known_choices()
+assert "lerobot_pf2mp/MazeLarge-v0" in gymnasium.registry
+import lerobot_pf2mp.dataset_tools.collect_maze
+print("discovered")
+"""
+
+
+def test_distribution_name_is_one_that_lerobot_looks_for() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["name"] == "lerobot_policy_pf2mp"
+
+
+def test_constraints_hold_names_and_versions_only() -> None:
+    for line in (ROOT / "constraints.txt").read_text().splitlines():
+        name, _, version = line.partition("==")
+        assert name, line
+        assert version, line
+        assert not set(line) & set("/:@ "), line
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "eval_configs").glob("*.yaml")), ids=lambda path: path.stem)
+def test_configuration_files_are_valid(path: Path) -> None:
+    import draccus
+    from lerobot.configs.train import TrainPipelineConfig
+
+    from lerobot_pf2mp import PF2MPConfig, PF2MPMazeEnv
+
+    content = yaml.safe_load(path.read_text())
+    if path.stem.startswith("train_"):
+        config = draccus.parse(TrainPipelineConfig, path, args=[])
+        assert config.policy.horizon == 80
+    else:
+        assert PF2MPMazeEnv(task=content["env"]["task"]).type == content["env"]["type"]
+        overrides = {key: value for key, value in content["policy"].items() if key != "path"}
+        PF2MPConfig(device="cpu", **overrides)
+
+
+@pytest.mark.slow
+def test_a_fresh_interpreter_discovers_the_installed_wheel(tmp_path: Path) -> None:
+    # By default the wheel is built from the source distribution, which is therefore tested too.
+    subprocess.run(
+        [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(tmp_path), str(ROOT)],
+        check=True,
+        capture_output=True,
+    )
+    (wheel,) = tmp_path.glob("*.whl")
+    fresh = tmp_path / "fresh"
+    venv.create(fresh, with_pip=False)
+    (site_packages,) = fresh.glob("lib/python*/site-packages")
+    zipfile.ZipFile(wheel).extractall(site_packages)
+    # The dependencies are this environment's; its own .pth files, and with them the editable install, are not followed.
+    (site_packages / "dependencies.pth").write_text(sysconfig.get_paths()["purelib"])
+    finished = subprocess.run(
+        [str(fresh / "bin/python"), "-c", DISCOVER, str(fresh)],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        check=False,
+    )
+    assert finished.returncode == 0, finished.stderr
+    assert "discovered" in finished.stdout
