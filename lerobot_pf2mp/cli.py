@@ -13,6 +13,8 @@ from typing import Any
 
 import draccus
 
+from lerobot_pf2mp.envs.configs import PF2MPMazeEnv
+
 INTERRUPTED = 130  # the shell's exit code for Ctrl-C
 
 
@@ -109,6 +111,32 @@ class DemoConfig:
     seed: int = 0
 
 
+@dataclass
+class BenchmarkConfig:
+    """Compares kinds of guidance of one checkpoint on the same start-goal pairs and writes a CSV file and a table.
+
+    Examples:
+        pf2mp-benchmark --checkpoint=outputs/maze_large/checkpoints/last/pretrained_model \
+--env.task=MazeLarge-v0 --output=results/maze_large.csv
+        pf2mp-benchmark --checkpoint=CHECKPOINT --guidance='[fmp, proximal:0.8, euler:0.0001]' --n_episodes=100
+    """
+
+    # The checkpoint's pretrained_model folder.
+    checkpoint: Path | None = None
+    # The maze and how it is run.
+    env: PF2MPMazeEnv = field(default_factory=PF2MPMazeEnv)
+    # Kinds of guidance: fmp (none), or INTEGRATOR:LAMBDA.
+    guidance: list[str] = field(default_factory=lambda: ["fmp", "proximal:0.8"])
+    # Start-goal pairs, the same for every kind of guidance and every repeat.
+    n_episodes: int = 500
+    # Repeats with other noise.
+    n_repeats: int = 3
+    # Seed of the first pair; pair i has seed + i.
+    seed: int = 100000
+    # The CSV file to write, one row for each kind of guidance and repeat.
+    output: Path = Path("results.csv")
+
+
 def collect() -> None:
     """The command pf2mp-collect."""
     _run(CollectConfig, _collect)
@@ -122,6 +150,11 @@ def convert() -> None:
 def demo() -> None:
     """The command pf2mp-demo."""
     _run(DemoConfig, _demo)
+
+
+def benchmark() -> None:
+    """The command pf2mp-benchmark."""
+    _run(BenchmarkConfig, _benchmark)
 
 
 def train() -> None:
@@ -191,6 +224,23 @@ def _demo(config: DemoConfig) -> None:
         n_episodes=config.n_episodes,
         seed=config.seed,
     )
+
+
+def _benchmark(config: BenchmarkConfig) -> None:
+    from lerobot_pf2mp.benchmark import Guidance, make_table, run_benchmark, write_results
+
+    if config.checkpoint is None:
+        raise ValueError("--checkpoint must name a pretrained_model folder, got none")
+    results = run_benchmark(
+        config.checkpoint,
+        config.env,
+        [Guidance.parse(text) for text in config.guidance],
+        n_episodes=config.n_episodes,
+        n_repeats=config.n_repeats,
+        seed=config.seed,
+    )
+    write_results(config.output, results)
+    print(f"{make_table(results)}\nWrote {config.output}.")
 
 
 def _dataset_place(config: CollectConfig | ConvertConfig) -> tuple[str, Path]:

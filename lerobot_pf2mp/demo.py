@@ -4,32 +4,33 @@
 from __future__ import annotations
 
 import json
-import platform
 import shlex
 import shutil
 import subprocess
 import sys
 import time
 from contextlib import nullcontext
-from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from lerobot_pf2mp.benchmark import Result, write_results
 from lerobot_pf2mp.dataset_tools.collect_maze import collect_maze
 from lerobot_pf2mp.dataset_tools.maze_dataset import maze_of
 from lerobot_pf2mp.envs import MAZE_TASKS
 from lerobot_pf2mp.envs.maze import BALL_RADIUS, SweptBall, make_point_maze
 from lerobot_pf2mp.loading import load_policy
 from lerobot_pf2mp.plots import MazePath, plot_maze_overview
+from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
 from lerobot_pf2mp.statistics import Rate
 
 _MODULES = {
     "pf2mp-train": "lerobot_pf2mp.train",
     "lerobot-eval": "lerobot.scripts.lerobot_eval",
 }
+DEFAULT_GUIDANCE_SCALE = PF2MPConfig.guidance_scale
 _N_FIGURE_EPISODES = 200
 
 
@@ -88,19 +89,22 @@ def run_demo(
     _say(2, f"Training: a small network, {steps} steps; the potential field is fitted on the way")
     _train(task, data, output_dir / "train", steps, seed)
 
-    rates = {}
-    for stage, (policy, scale) in enumerate((("fmp", "0"), ("pf2mp", None)), start=3):
-        name = "PF2MP: the same weights with guidance" if policy == "pf2mp" else "FMP: guidance off"
+    results = []
+    for stage, (name, scale) in enumerate(
+        (("FMP: guidance off", 0.0), ("PF2MP: the same weights with guidance", DEFAULT_GUIDANCE_SCALE)),
+        start=3,
+    ):
         _say(stage, f"Evaluation of {name}, {n_episodes} episodes")
-        rates[policy] = _evaluate(task, checkpoint, output_dir / f"eval_{policy}", n_episodes, seed, scale)
+        folder = output_dir / ("eval_pf2mp" if scale else "eval_fmp")
+        results.append(_evaluate(task, checkpoint, folder, n_episodes, seed, scale))
 
     _say(5, "Figure and table")
     figure = output_dir / "overview.png"
     if not figure.exists():
         _plot(checkpoint, maze, figure, seed)
-    table = _table(rates)
+    table = _table(results)
     (output_dir / "results.md").write_text(table, encoding="utf-8")
-    _write_csv(output_dir / "results.csv", rates, options)
+    write_results(output_dir / "results.csv", results)
     print(f"\n{table}\nFigure: {figure}\nTable: {output_dir / 'results.md'}")
     print(f"Time: {(time.monotonic() - began) / 60:.1f} minutes")
 
@@ -160,18 +164,18 @@ def _train(task: str, data: Path, output_dir: Path, steps: int, seed: int) -> No
 
 
 def _evaluate(
-    task: str, checkpoint: Path, output_dir: Path, n_episodes: int, seed: int, guidance_scale: str | None
-) -> dict[str, Rate]:
+    task: str, checkpoint: Path, output_dir: Path, n_episodes: int, seed: int, guidance_scale: float
+) -> Result:
+    env_task = {maze: name for name, maze in MAZE_TASKS.items()}[maze_of(task, None)]
     result = output_dir / "eval_info.json"
     if result.exists():
         print("done already")
     else:
         shutil.rmtree(output_dir, ignore_errors=True)
-        env_task = {maze: name for name, maze in MAZE_TASKS.items()}[maze_of(task, None)]
         _run(
             "lerobot-eval",
             f"--policy.path={checkpoint}",
-            *([] if guidance_scale is None else [f"--policy.guidance_scale={guidance_scale}"]),
+            f"--policy.guidance_scale={guidance_scale:g}",
             "--env.type=pf2mp_maze",
             f"--env.task={env_task}",
             f"--eval.n_episodes={n_episodes}",
@@ -182,10 +186,17 @@ def _evaluate(
             log=output_dir.with_suffix(".log"),
         )
     metrics = json.loads(result.read_text())["per_task"][0]["metrics"]
-    return {
-        "collision": Rate(sum(reward < 0 for reward in metrics["sum_rewards"]), n_episodes),
-        "success": Rate(sum(metrics["successes"]), n_episodes),
-    }
+    return Result(
+        task=env_task,
+        policy="fmp" if guidance_scale == 0 else "pf2mp",
+        guidance_integrator="" if guidance_scale == 0 else "proximal",
+        guidance_scale=guidance_scale,
+        seed=seed,
+        repeat=0,
+        n_episodes=n_episodes,
+        collisions=sum(reward < 0 for reward in metrics["sum_rewards"]),
+        successes=sum(metrics["successes"]),
+    )
 
 
 def _run(command: str, *options: str, equivalent: str | None = None, log: Path | None = None) -> None:
@@ -254,39 +265,14 @@ def _way(ball: SweptBall, start: np.ndarray, chunk: np.ndarray) -> MazePath:
     return MazePath(positions, np.array([ball.clearance(*pair) < 0 for pair in pairwise(positions)]))
 
 
-def _table(rates: dict[str, dict[str, Rate]]) -> str:
-    lines = [
-        "| policy | collision rate | success rate | episodes |",
-        "|---|---|---|---|",
-    ]
-    for policy, rate in rates.items():
-        lines.append(f"| {policy} | {rate['collision']} | {rate['success']} | {rate['success'].total} |")
+def _table(results: list[Result]) -> str:
+    lines = ["| policy | collision rate | success rate | episodes |", "|---|---|---|---|"]
+    for result in results:
+        collision, success = (
+            Rate(count, result.n_episodes) for count in (result.collisions, result.successes)
+        )
+        lines.append(f"| {result.policy} | {collision} | {success} | {result.n_episodes} |")
     return "\n".join(lines) + "\n"
-
-
-def _write_csv(path: Path, rates: dict[str, dict[str, Rate]], options: dict[str, object]) -> None:
-    columns = [
-        *options,
-        "policy",
-        "collisions",
-        "successes",
-        "python",
-        "torch",
-        "lerobot",
-        "mujoco",
-        "machine",
-    ]
-    environment = [
-        platform.python_version(),
-        *(version(name) for name in ("torch", "lerobot", "mujoco")),
-        platform.machine(),
-    ]
-    rows = [
-        [*options.values(), policy, rate["collision"].count, rate["success"].count, *environment]
-        for policy, rate in rates.items()
-    ]
-    text = "\n".join(",".join(str(cell) for cell in row) for row in [columns, *rows])
-    path.write_text(f"{text}\n", encoding="utf-8")
 
 
 def _say(stage: int, what: str) -> None:

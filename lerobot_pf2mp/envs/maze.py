@@ -249,7 +249,7 @@ class MazeEnv(gym.Env):
         self._swept_ball = SweptBall(spec, collision_radius)
         self._picture = MazePicture(self._maze.maze.maze_map, render_size)
         border = np.array([self._maze.maze.x_map_center, self._maze.maze.y_map_center], dtype=np.float32)
-        self.action_space = spaces.Box(-border, border, dtype=np.float32)
+        self.action_space: spaces.Box = spaces.Box(-border, border, dtype=np.float32)
         self.observation_space = spaces.Dict(
             {
                 "agent_pos": spaces.Box(-border, border, dtype=np.float32),
@@ -362,9 +362,9 @@ class MazeEnv(gym.Env):
 def step_physics(
     model: mujoco.MjModel,
     data: mujoco.MjData,
-    target: Sequence[float],
-    target_velocity: Sequence[float] = (0.0, 0.0),
-    force_noise: Sequence[float] = (0.0, 0.0),
+    target: Sequence[float] | np.ndarray,
+    target_velocity: Sequence[float] | np.ndarray = (0.0, 0.0),
+    force_noise: Sequence[float] | np.ndarray = (0.0, 0.0),
 ) -> None:
     """One physics step of PointMaze under the PD controller of D4RL's generator.
 

@@ -35,7 +35,9 @@ class MazePicture:
         # Video encoders want even sides.
         self._size = (2 * round(self._columns * scale / 2), 2 * round(self._rows * scale / 2))
         self._scale = _SUPERSAMPLING * scale  # drawn pixels for each metre
-        self._background = Image.new("RGB", tuple(_SUPERSAMPLING * side for side in self._size), FLOOR)
+        self._background = Image.new(
+            "RGB", (_SUPERSAMPLING * self._size[0], _SUPERSAMPLING * self._size[1]), FLOOR
+        )
         draw = ImageDraw.Draw(self._background)
         for i, row in enumerate(maze_map):
             for j, cell in enumerate(row):

@@ -8,6 +8,7 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 
+from lerobot_pf2mp.errors import reported_on_the_command_line
 from lerobot_pf2mp.flow_matching import INTEGRATORS, TIME_SAMPLINGS
 
 
@@ -113,9 +114,13 @@ class FMPConfig(PreTrainedConfig):
         """Validates the values.
 
         Raises:
-            ValueError: If one breaks its rule.
+            ConfigError: If one breaks its rule.
         """
         super().__post_init__()
+        with reported_on_the_command_line():
+            self._validate()
+
+    def _validate(self) -> None:
         for name in ("n_obs_steps", "horizon", "n_action_steps", "num_inference_steps"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")

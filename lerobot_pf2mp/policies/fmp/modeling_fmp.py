@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, cast
 
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
@@ -62,7 +62,7 @@ class FMPPolicy(PreTrainedPolicy):
     @property
     def inference_network(self) -> VelocityNetwork:
         """The network that evaluation uses: the moving average, unless `use_ema` is off."""
-        return self.network if self.ema is None else self.ema.module
+        return self.network if self.ema is None else cast(VelocityNetwork, self.ema.module)
 
     def get_optim_params(self) -> Iterable[torch.nn.Parameter]:
         """The weights that the optimiser trains."""

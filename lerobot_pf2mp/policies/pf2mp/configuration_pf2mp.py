@@ -41,13 +41,8 @@ class PF2MPConfig(FMPConfig):
     field_threshold_quantile: float = 0.01
     field_alpha: float = -0.1
 
-    def __post_init__(self) -> None:
-        """Validates the values.
-
-        Raises:
-            ValueError: If one breaks its rule.
-        """
-        super().__post_init__()
+    def _validate(self) -> None:
+        super()._validate()
         if not (self.guidance_scale >= 0 and math.isfinite(self.guidance_scale)):
             raise ValueError(f"guidance_scale must be finite and at least 0, got {self.guidance_scale}")
         if self.guidance_integrator not in GUIDANCE_INTEGRATORS:

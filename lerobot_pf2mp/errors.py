@@ -1,0 +1,24 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The one error type of this package; everything else raises Python's own."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from draccus.utils import ParsingError
+
+
+class ConfigError(ParsingError):
+    """A value of a configuration breaks its rule.
+
+    Deliberately no ValueError: LeRobot's command line replaces those by "Couldn't instantiate class" and drops the
+    reason, whereas it prints the message of an error of this type.
+    """
+
+
+@contextmanager
+def reported_on_the_command_line() -> Iterator[None]:
+    """Turns a ValueError of the block into a `ConfigError` with the same message."""
+    try:
+        yield
+    except ValueError as error:
+        raise ConfigError(str(error)) from error

@@ -1,0 +1,303 @@
+# SPDX-License-Identifier: Apache-2.0
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot.datasets import LeRobotDataset
+from test_convert import FOREIGN_LAYOUT, demonstrations, line, write_d4rl, write_pointmaze
+
+from lerobot_pf2mp import cli
+
+BIN = Path(sys.executable).parent
+SECONDS = 120
+COLLECT_SMALL = ("--task=maze_umaze", "--n_episodes=3", "--n_steps=5")
+
+
+def run(command: str, *arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [BIN / command, *arguments], cwd=cwd, capture_output=True, text=True, timeout=SECONDS, check=False
+    )
+
+
+def everything_in(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+def error_of(stderr: str) -> str:
+    """The only line that starts with "error:", which must be the last."""
+    lines = stderr.strip().splitlines()
+    assert "Traceback" not in stderr
+    assert [line for line in lines if line.startswith("error:")] == lines[-1:]
+    return lines[-1]
+
+
+@pytest.fixture
+def refused(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Runs a command in this process and returns the line with which it ends."""
+
+    def refused(command: Callable[[], None], *arguments: str) -> str:
+        monkeypatch.setattr(sys, "argv", [f"pf2mp-{command.__name__}", *arguments])
+        capfd.readouterr()
+        with pytest.raises(SystemExit, match="1") as exit_:
+            command()
+        assert exit_.value.code == 1
+        captured = capfd.readouterr()
+        assert "Wrote" not in captured.out
+        return error_of(captured.err)
+
+    return refused
+
+
+# pf2mp-collect
+
+
+@pytest.mark.slow
+def test_collect_writes_a_dataset_that_lerobot_opens_and_does_not_replace_it_unasked(tmp_path: Path) -> None:
+    root = tmp_path / "data" / "umaze"
+    options = ("--task=maze_umaze", "--n_episodes=20", "--n_steps=80", "--seed=3", f"--root={root}")
+    result = run("pf2mp-collect", *options)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.strip() == f"Wrote 20 episodes of 80 steps to {root} (left out: none)."
+    assert "Traceback" not in result.stderr
+    dataset = LeRobotDataset("local/maze_umaze", root=root)
+    assert (dataset.num_episodes, dataset.num_frames) == (20, 1600)
+    assert dataset.features["action"]["shape"] == (2,)
+    first = demonstrations("umaze", 1, seed=3)[0]
+    np.testing.assert_allclose(dataset[0]["observation.state"], first.positions[0], rtol=1e-6)
+    assert [path.name for path in (tmp_path / "data").iterdir()] == ["umaze"]
+
+    before = (root / "meta/info.json").stat().st_mtime_ns
+    again = run("pf2mp-collect", *options)
+    assert again.returncode == 1
+    assert (
+        error_of(again.stderr)
+        == f"error: {root} exists already: choose another --root, or pass --overwrite=true"
+    )
+    assert (root / "meta/info.json").stat().st_mtime_ns == before
+
+
+@pytest.mark.slow
+def test_unknown_options_end_with_the_usage_and_nothing_written(tmp_path: Path) -> None:
+    result = run("pf2mp-collect", f"--root={tmp_path / 'd'}", "--n_episode=3", cwd=tmp_path)
+    assert result.returncode == 2
+    assert "usage: pf2mp-collect" in result.stderr
+    assert "error: unrecognized arguments: --n_episode=3" in result.stderr
+    assert "Traceback" not in result.stderr
+    assert everything_in(tmp_path) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["pf2mp-collect", "pf2mp-convert"])
+def test_help_shows_examples_units_and_defaults(command: str) -> None:
+    result = run(command, "--help")
+    assert result.returncode == 0
+    assert result.stderr == ""
+    words = " ".join(result.stdout.split())
+    assert f"Examples: {command} --" in words
+    assert "by default local/TASK" in words
+    assert "(default: 80)" in words
+    if command == "pf2mp-collect":
+        assert "of which 1 is the largest (100 N)" in words
+        assert "(default: 4000)" in words
+    for task in ("maze_umaze", "maze_medium", "maze_large"):
+        assert task in words
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wait_for_frames", [False, True])
+def test_ctrl_c_in_the_middle_of_collecting_leaves_nothing_behind(
+    tmp_path: Path, wait_for_frames: bool
+) -> None:
+    process = subprocess.Popen(
+        [BIN / "pf2mp-collect", "--n_episodes=4000", f"--root={tmp_path / 'd'}"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "TMPDIR": str(tmp_path)},
+    )
+    try:
+        end = time.monotonic() + SECONDS
+        # Interrupt it as soon as the first frames are written, or after more than the 100 episodes that are buffered.
+        under_way = (
+            "new/meta/episodes/chunk-000/*.parquet" if wait_for_frames else "new/data/chunk-000/*.parquet"
+        )
+        while not any(tmp_path.glob(f".d.*.partial/{under_way}")):
+            assert process.poll() is None, process.communicate()
+            assert time.monotonic() < end
+            time.sleep(0.01)
+        time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        output, errors = process.communicate(timeout=SECONDS)
+    finally:
+        process.kill()
+        process.wait()
+    assert process.returncode == 130
+    assert output == ""
+    assert errors.strip().splitlines()[-1] == "interrupted: nothing half-written was left behind"
+    assert "Traceback" not in errors
+    assert everything_in(tmp_path) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            ["--task=kitchen"],
+            "error: task must be one of ['maze_umaze', 'maze_medium', 'maze_large'], got 'kitchen'",
+        ),
+        (["--n_episodes=0"], "error: n_episodes must be at least 1, got 0"),
+        (["--n_episodes=-5"], "error: n_episodes must be at least 1, got -5"),
+        (["--n_episodes=many"], "error: `n_episodes`: Couldn't parse 'many' into an int"),
+        (["--n_steps=1"], "error: n_steps must be at least 2, got 1"),
+        (["--action_noise=-0.5"], "error: action_noise must be finite and at least 0, got -0.5"),
+        (["--action_noise=nan"], "error: action_noise must be finite and at least 0, got nan"),
+        (["--maze_map=11111/10000/11111"], "error: maze_map must be closed"),
+        (["--maze_map=11111/10101/11111"], "error: maze_map must be connected"),
+        (["--maze_map=nowhere"], "error: maze_map must be one of ['umaze', 'medium', 'large']"),
+        (["--seed=-1"], "error: seed must be at least 0, got -1"),
+        (["--overwrite=perhaps"], "error: `overwrite`: Couldn't parse 'perhaps' into a bool"),
+    ],
+)
+def test_bad_values_for_collect_end_in_one_line_and_nothing_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Callable[..., str], options: list, message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    line = refused(cli.collect, *COLLECT_SMALL, f"--root={tmp_path / 'd'}", *options)
+    assert line.startswith(message)
+    assert everything_in(tmp_path) == []
+
+
+@pytest.mark.slow
+def test_a_root_that_cannot_be_made_ends_in_one_line(tmp_path: Path, refused: Callable[..., str]) -> None:
+    (tmp_path / "file").write_text("in the way")
+    assert str(tmp_path / "file") in refused(cli.collect, *COLLECT_SMALL, f"--root={tmp_path / 'file' / 'd'}")
+    assert everything_in(tmp_path) == ["file"]
+
+
+@pytest.mark.slow
+def test_overwrite_replaces_a_dataset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    for n_episodes in (3, 4):
+        options = (f"--n_episodes={n_episodes}", "--overwrite=true", f"--root={tmp_path / 'd'}")
+        monkeypatch.setattr(sys, "argv", ["pf2mp-collect", "--task=maze_umaze", "--n_steps=5", *options])
+        cli.collect()
+        assert f"Wrote {n_episodes} episodes of 5 steps" in capsys.readouterr().out
+        info = json.loads((tmp_path / "d/meta/info.json").read_text())
+        assert (info["total_episodes"], info["total_frames"]) == (n_episodes, 5 * n_episodes)
+    assert [path.name for path in tmp_path.iterdir()] == ["d"]
+
+
+@pytest.mark.slow
+def test_a_root_below_the_home_folder_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # A shell does not expand the ~ of --root=~/d.
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["pf2mp-collect", *COLLECT_SMALL, "--root=~/d"])
+    cli.collect()
+    assert [path.name for path in tmp_path.iterdir()] == ["home"]
+    assert (tmp_path / "home" / "d" / "meta" / "info.json").is_file()
+
+
+# pf2mp-convert
+
+
+@pytest.mark.slow
+def test_convert_turns_a_d4rl_file_into_a_dataset_and_says_what_was_left_out(tmp_path: Path) -> None:
+    trajectories = demonstrations("medium", 4)
+    trajectories[2:2] = [line((-2.5, 2.5), (2.5, -2.5), 200), line((-2.5, 2.5), (-2.4, 2.5), 1)]
+    path = write_d4rl(tmp_path / "maze2d.hdf5", trajectories, "medium", with_timeouts=True)
+    root = tmp_path / "d"
+    result = run(
+        "pf2mp-convert",
+        "--source.type=d4rl",
+        f"--source.path={path}",
+        "--task=maze_medium",
+        "--n_steps=40",
+        f"--root={root}",
+    )
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.strip() == (
+        f"Wrote 4 episodes of 40 steps to {root} (left out: 1 in collision, 1 shorter than 2 steps)."
+    )
+    dataset = LeRobotDataset("local/maze_medium", root=root)
+    assert (dataset.num_episodes, dataset.num_frames) == (4, 160)
+    for number, index in enumerate((0, 1, 4, 5)):
+        sample = dataset[40 * number]
+        np.testing.assert_allclose(sample["observation.state"], trajectories[index].positions[0], atol=1e-5)
+        np.testing.assert_allclose(
+            sample["observation.environment_state"], trajectories[index].goal, atol=1e-5
+        )
+    assert "Converted from maze2d.hdf5 (d4rl)." in (root / "README.md").read_text()
+    assert everything_in(tmp_path)[0] == "d"
+
+
+@pytest.mark.slow
+def test_convert_reads_minari_and_stops_at_the_number_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    expected = demonstrations("umaze", 5)
+    folder = write_pointmaze(tmp_path / "in", monkeypatch, expected)
+    monkeypatch.setattr(
+        sys,
+        "argv",
+        [
+            "pf2mp-convert",
+            "--source.type=minari",
+            f"--source.path={folder}",
+            "--task=maze_umaze",
+            "--n_episodes=3",
+            "--n_steps=10",
+            "--repo_id=me/minari",
+            f"--root={tmp_path / 'd'}",
+        ],
+    )
+    cli.convert()
+    assert "Wrote 3 episodes of 10 steps" in capsys.readouterr().out
+    dataset = LeRobotDataset("me/minari", root=tmp_path / "d")
+    goals = [dataset[10 * number]["observation.environment_state"] for number in range(3)]
+    np.testing.assert_allclose(goals, [trajectory.goal for trajectory in expected[:3]], rtol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ([], "error: --source.path must name the recording, got none"),
+        (
+            ["--source.path=no.hdf5"],
+            "error: source.path must be an HDF5 file, got no.hdf5, which does not exist",
+        ),
+        (["--source.path=text.hdf5"], "error: text.hdf5 must be a whole HDF5 file"),
+        (
+            ["--source.path=no", "--source.type=minari"],
+            "error: source.path must be the folder of a Minari dataset",
+        ),
+        (["--source.path=.", "--source.type=minari"], "error: . must hold a Minari dataset"),
+        (
+            ["--source.path=good.hdf5", "--source.type=rlds"],
+            "error: --source.type must be one of ['d4rl', 'minari']",
+        ),
+        (["--source.path=good.hdf5", "--task=maze"], "error: task must be one of"),
+        (["--source.path=good.hdf5", "--n_steps=0"], "error: n_steps must be at least 2, got 0"),
+        (["--source.path=good.hdf5", "--n_episodes=0"], "error: n_episodes must be at least 1, got 0"),
+        (["--source.path=foreign.hdf5"], f"error: a D4RL maze2d file must hold {FOREIGN_LAYOUT}"),
+    ],
+)
+def test_bad_values_for_convert_end_in_one_line_and_nothing_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Callable[..., str], options: list, message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    trajectories = demonstrations("large", 2)
+    write_d4rl(Path("good.hdf5"), trajectories, "large", with_timeouts=True)
+    write_d4rl(Path("foreign.hdf5"), trajectories, "large", with_timeouts=True, infos__goal=None)
+    Path("text.hdf5").write_text("404")
+    before = everything_in(tmp_path)
+    assert refused(cli.convert, f"--root={tmp_path / 'd'}", *options).startswith(message)
+    assert everything_in(tmp_path) == before

@@ -1,0 +1,431 @@
+# SPDX-License-Identifier: Apache-2.0
+import itertools
+import shutil
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import gymnasium as gym
+import h5py
+import numpy as np
+import pytest
+from lerobot.datasets import LeRobotDataset
+from lerobot_pf2mp.dataset_tools.convert_d4rl import read_d4rl
+from lerobot_pf2mp.dataset_tools.convert_minari import read_minari
+from lerobot_pf2mp.dataset_tools.episodes import Trajectory, resample
+from lerobot_pf2mp.dataset_tools.maze_dataset import write_maze_dataset
+from lerobot_pf2mp.dataset_tools.maze_expert import MazeExpert
+
+from lerobot_pf2mp.envs.maze import parse_maze_map
+
+LOPSIDED = (
+    "1111111/1000001/1111101/1110001/1111111"  # tells rows from columns, north from south, east from west
+)
+FOREIGN_LAYOUT = "observations and infos/goal"
+
+
+def demonstrations(maze: str, n: int, seed: int = 0) -> list[Trajectory]:
+    return list(itertools.islice(MazeExpert(maze, 0.0, seed).trajectories(), n))
+
+
+def line(start: tuple[float, float], end: tuple[float, float], n_steps: int) -> Trajectory:
+    return Trajectory(np.linspace(start, end, n_steps + 1), np.array(end))
+
+
+def to_d4rl(positions: np.ndarray, maze: str) -> np.ndarray:
+    """Joint positions of D4RL's model: i - 0.2 and j - 0.2 at the centre of cell (i, j)."""
+    rows = parse_maze_map(maze)
+    column = positions[:, 0] + len(rows[0]) / 2 - 0.5
+    row = len(rows) / 2 - positions[:, 1] - 0.5
+    return np.stack([row - 0.2, column - 0.2], axis=1).astype(np.float32)
+
+
+def write_d4rl(
+    path: Path, trajectories: list[Trajectory], maze: str, with_timeouts: bool, **changes: np.ndarray | None
+) -> Path:
+    """A file as D4RL's generator leaves it, one step after the other; the released files have timeouts besides."""
+    positions = np.concatenate([to_d4rl(t.positions, maze) for t in trajectories])
+    goals = np.concatenate([to_d4rl(np.tile(t.goal, (len(t.positions), 1)), maze) for t in trajectories])
+    ends = np.cumsum([len(t.positions) for t in trajectories]) - 1
+    n = len(positions)
+    velocities = np.zeros((n, 2), np.float32)
+    columns: dict[str, np.ndarray | None] = {
+        "observations": np.hstack([positions, velocities]),
+        "actions": np.zeros((n, 2), np.float32),
+        "rewards": np.zeros(n, np.float32),
+        "terminals": np.zeros(n, bool),
+        "infos/goal": goals,
+        "infos/qpos": positions,
+        "infos/qvel": velocities,
+        "timeouts": np.isin(np.arange(n), ends) if with_timeouts else None,
+        **{key.replace("__", "/"): value for key, value in changes.items()},
+    }
+    with h5py.File(path, "w") as file:
+        for key, value in columns.items():
+            if value is not None:
+                file.create_dataset(key, data=value, compression="gzip" if value.ndim else None)
+    return path
+
+
+def assert_same(read: list[Trajectory], expected: list[Trajectory], atol: float) -> None:
+    assert len(read) == len(expected)
+    for left, right in zip(read, expected, strict=True):
+        assert left.n_steps == right.n_steps
+        np.testing.assert_allclose(left.positions, right.positions, rtol=0, atol=atol)
+        np.testing.assert_allclose(left.goal, right.goal, rtol=0, atol=atol)
+
+
+# D4RL
+
+
+@pytest.mark.parametrize("maze", ["umaze", "medium", "large", LOPSIDED])
+@pytest.mark.parametrize("timeouts", [True, False])
+def test_d4rl_files_give_back_positions_and_goals_in_the_coordinates_of_the_environment(
+    tmp_path: Path, maze: str, timeouts: bool
+) -> None:
+    expected = demonstrations(maze, 12)
+    path = write_d4rl(tmp_path / "maze2d.hdf5", expected, maze, timeouts)
+    assert_same(read_d4rl(path, maze), expected, atol=1e-5)
+
+
+def test_the_first_free_cell_of_d4rl_is_the_northwestern_one(tmp_path: Path) -> None:
+    # D4RL's maze2d-large: reset at cell (1, 1) is joint position (0.8, 0.8), goal cell (7, 10) likewise.
+    cells = np.array([[1, 1], [1, 2], [2, 1], [7, 10]], np.float32) - 0.2
+    observations = np.hstack([cells, np.zeros((4, 2), np.float32)])
+    path = write_d4rl(
+        tmp_path / "maze2d.hdf5",
+        [line((0, 0), (1, 1), 3)],
+        "large",
+        with_timeouts=False,
+        observations=observations,
+        infos__goal=np.tile(cells[-1], (4, 1)),
+    )
+    (trajectory,) = read_d4rl(path, "large")
+    np.testing.assert_allclose(trajectory.positions, [[-4.5, 3], [-3.5, 3], [-4.5, 2], [4.5, -3]], atol=1e-6)
+    np.testing.assert_allclose(trajectory.goal, [4.5, -3], atol=1e-6)
+
+
+def test_timeouts_part_trajectories_with_one_goal_and_rounding_does_not(tmp_path: Path) -> None:
+    there, back = line((-1, 1), (1, 1), 9), line((1, 1), (-1, 1), 7)
+    expected = [there, Trajectory(back.positions, there.goal)]
+    path = write_d4rl(tmp_path / "with.hdf5", expected, LOPSIDED, with_timeouts=True)
+    assert_same(read_d4rl(path, LOPSIDED), expected, atol=1e-5)
+    goals = to_d4rl(np.tile(there.goal, (10, 1)), LOPSIDED) * (
+        1 + np.float32(2e-7) * np.arange(10)[:, None] % 2
+    )
+    path = write_d4rl(tmp_path / "without.hdf5", [there], LOPSIDED, with_timeouts=False, infos__goal=goals)
+    assert_same(read_d4rl(path, LOPSIDED), [there], atol=1e-5)
+
+
+@pytest.mark.parametrize("timeouts", [True, False])
+def test_colliding_and_short_trajectories_of_d4rl_are_left_out_and_counted(
+    tmp_path: Path, timeouts: bool
+) -> None:
+    good = demonstrations("medium", 5)
+    through_walls = line((-2.5, 2.5), (2.5, -2.5), 200)
+    trajectories = [
+        good[0],
+        through_walls,
+        line((-2.5, 2.5), (-2.4, 2.5), 1),
+        *good[1:4],
+        line((-2.5, 2.5), (-2.5, 2.5), 0),
+        good[4],
+    ]
+    path = write_d4rl(tmp_path / "maze2d.hdf5", trajectories, "medium", timeouts)
+    n_written, dropped = write_maze_dataset(
+        read_d4rl(path, "medium"), root=tmp_path / "d", repo_id="a/b", maze="medium", origin="", n_steps=80
+    )
+    assert n_written == 5
+    assert dropped == {"in collision": 1, "shorter than 2 steps": 2}
+    dataset = LeRobotDataset("a/b", root=tmp_path / "d")
+    for number, trajectory in enumerate(good):
+        way = resample(trajectory.positions, 80)
+        for step in (0, 1, 40, 79):
+            sample = dataset[80 * number + step]
+            np.testing.assert_allclose(sample["observation.state"], way[step], atol=1e-5)
+            np.testing.assert_allclose(sample["action"], way[step + 1], atol=1e-5)
+            np.testing.assert_allclose(sample["observation.environment_state"], trajectory.goal, atol=1e-5)
+
+
+def test_d4rl_files_without_a_usable_trajectory_are_refused(tmp_path: Path) -> None:
+    short = [line((-1, 1), (x, 1), 1) for x in (-0.9, -0.8, -0.7)]
+    path = write_d4rl(tmp_path / "maze2d.hdf5", short, LOPSIDED, with_timeouts=True)
+    with pytest.raises(ValueError, match="at least one episode, got none that is usable"):
+        write_maze_dataset(
+            read_d4rl(path, LOPSIDED),
+            root=tmp_path / "d",
+            repo_id="a/b",
+            maze=LOPSIDED,
+            origin="",
+            n_steps=80,
+        )
+    assert [path.name for path in tmp_path.iterdir()] == ["maze2d.hdf5"]
+
+
+def test_a_missing_d4rl_file_is_named(tmp_path: Path) -> None:
+    for path in (tmp_path / "nowhere.hdf5", tmp_path):
+        with pytest.raises(FileNotFoundError, match=f"source.path must be an HDF5 file, got {path}"):
+            read_d4rl(path, "large")
+
+
+def test_a_d4rl_file_may_be_given_below_the_home_folder(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    expected = demonstrations("umaze", 2)
+    write_d4rl(tmp_path / "maze2d.hdf5", expected, "umaze", with_timeouts=True)
+    assert_same(read_d4rl(Path("~/maze2d.hdf5"), "umaze"), expected, atol=1e-5)
+
+
+def text(path: Path) -> None:
+    path.write_text("<html>404 not found</html>")
+
+
+def empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def cut_in_half(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def garbled_in_the_middle(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    with h5py.File(path) as file:
+        chunk = file["observations"].id.get_chunk_info(0)
+    content[chunk.byte_offset : chunk.byte_offset + chunk.size] = bytes(chunk.size)
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("damage", [text, empty, cut_in_half, garbled_in_the_middle])
+def test_files_that_are_not_whole_hdf5_files_are_refused(
+    tmp_path: Path, damage: Callable[[Path], None]
+) -> None:
+    path = write_d4rl(tmp_path / "maze2d.hdf5", demonstrations("umaze", 4), "umaze", with_timeouts=True)
+    damage(path)
+    with pytest.raises(ValueError, match=r"maze2d\.hdf5 must be a whole HDF5 file"):
+        read_d4rl(path, "umaze")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"observations": None}, "must hold observations and infos/goal, .* missing: observations"),
+        ({"infos__goal": None}, "must hold observations and infos/goal, .* missing: infos/goal"),
+        ({"observations": np.zeros((10, 2))}, r"shape \(N, 4\) .* got \(10, 2\)"),
+        ({"observations": np.zeros((10, 4, 1))}, r"shape \(N, 4\) .* got \(10, 4, 1\)"),
+        ({"observations": np.zeros(10)}, r"shape \(N, 4\) .* got \(10,\)"),
+        ({"observations": np.zeros((9, 4))}, r"infos/goal \(N, 2\), got \(9, 4\) and \(10, 2\)"),
+        ({"infos__goal": np.zeros((10, 3))}, r"infos/goal \(N, 2\), got \(10, 4\) and \(10, 3\)"),
+        ({"infos__goal": np.zeros((0, 2)), "observations": np.zeros((0, 4))}, "timeouts must have one entry"),
+        ({"timeouts": np.zeros(9, bool)}, "timeouts must have one entry .* got 9 for 10"),
+        ({"timeouts": np.zeros((10, 2), bool)}, "timeouts must have one entry"),
+        ({"observations": np.full((10, 4), np.nan)}, "observations must be finite, .* in row 0"),
+        (
+            {"infos__goal": np.diag(np.r_[np.zeros(9), np.inf])[:, 8:]},
+            "infos/goal must be finite, .* in row 9",
+        ),
+    ],
+)
+def test_hdf5_files_of_another_layout_are_refused(tmp_path: Path, changes: dict, message: str) -> None:
+    path = write_d4rl(
+        tmp_path / "a.hdf5", [line((-1, 1), (1, 1), 9)], LOPSIDED, with_timeouts=True, **changes
+    )
+    with pytest.raises(ValueError, match=message):
+        read_d4rl(path, LOPSIDED)
+
+
+def test_hdf5_files_with_groups_or_numbers_for_columns_are_refused(tmp_path: Path) -> None:
+    # As in a Minari file, and in a file of summaries.
+    path = write_d4rl(
+        tmp_path / "a.hdf5", [line((-1, 1), (1, 1), 9)], LOPSIDED, with_timeouts=True, observations=None
+    )
+    with h5py.File(path, "a") as file:
+        file.create_group("observations").create_dataset("achieved_goal", data=np.zeros((10, 2)))
+    with pytest.raises(ValueError, match="observations"):
+        read_d4rl(path, LOPSIDED)
+    with h5py.File(path, "a") as file:
+        del file["observations"]
+        file["observations"] = 3.0
+    with pytest.raises(ValueError, match=r"observations|scalar"):
+        read_d4rl(path, LOPSIDED)
+
+
+def test_d4rl_files_recorded_in_another_maze_are_left_out_as_colliding(tmp_path: Path) -> None:
+    path = write_d4rl(tmp_path / "maze2d.hdf5", demonstrations("large", 6), "large", with_timeouts=True)
+    with pytest.raises(ValueError, match="at least one episode"):
+        write_maze_dataset(
+            read_d4rl(path, LOPSIDED),
+            root=tmp_path / "d",
+            repo_id="a/b",
+            maze=LOPSIDED,
+            origin="",
+            n_steps=80,
+        )
+
+
+# Minari
+
+
+def write_minari(
+    datasets: Path, monkeypatch: pytest.MonkeyPatch, observations: list, space: gym.Space
+) -> Path:
+    import minari
+    from minari.data_collector import EpisodeBuffer
+
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(datasets))
+    buffers = []
+    for number, observation in enumerate(observations):
+        length = len(next(iter(observation.values())) if isinstance(observation, dict) else observation) - 1
+        buffers.append(
+            EpisodeBuffer(
+                id=number,
+                observations=observation,
+                actions=np.zeros((length, 2), np.float32),
+                rewards=np.zeros(length),
+                terminations=np.zeros(length, bool),
+                truncations=np.arange(length) == length - 1,
+            )
+        )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about the author, the code and the requirements
+        minari.create_dataset_from_buffers(
+            "D4RL/pointmaze/test-v0",
+            buffers,
+            action_space=gym.spaces.Box(-1, 1, (2,)),
+            observation_space=space,
+        )
+    return datasets / "D4RL" / "pointmaze" / "test-v0"
+
+
+def write_pointmaze(
+    datasets: Path, monkeypatch: pytest.MonkeyPatch, trajectories: list[Trajectory], n_dims: int = 2
+) -> Path:
+    """Episodes as PointMaze's are: the first desired goal is the one of the episode before."""
+    anything = {"low": -np.inf, "high": np.inf, "dtype": np.float64}
+    space = gym.spaces.Dict(
+        {
+            "observation": gym.spaces.Box(shape=(4,), **anything),
+            "achieved_goal": gym.spaces.Box(shape=(n_dims,), **anything),
+            "desired_goal": gym.spaces.Box(shape=(n_dims,), **anything),
+        }
+    )
+    observations = []
+    stale = trajectories[0].goal
+    for trajectory in trajectories:
+        goals = np.tile(trajectory.goal, (len(trajectory.positions), 1))
+        goals[0] = stale
+        stale = trajectory.goal
+        observations.append(
+            {
+                "observation": np.zeros((len(goals), 4)),
+                "achieved_goal": trajectory.positions,
+                "desired_goal": goals,
+            }
+        )
+    return write_minari(datasets, monkeypatch, observations, space)
+
+
+def test_minari_datasets_give_back_positions_and_the_goal_that_is_not_stale(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = demonstrations("large", 8)
+    folder = write_pointmaze(tmp_path, monkeypatch, expected)
+    n_episodes, trajectories = read_minari(folder)
+    assert n_episodes == 8
+    assert_same(list(trajectories), expected, atol=1e-12)
+
+
+def test_the_folder_of_a_minari_dataset_may_be_named_with_and_without_data(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = demonstrations("umaze", 3)
+    folder = write_pointmaze(tmp_path, monkeypatch, expected)
+    assert (folder / "data").is_dir()
+    monkeypatch.delenv("MINARI_DATASETS_PATH")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for path in (folder, folder / "data", Path("~") / folder.relative_to(tmp_path)):
+        assert_same(list(read_minari(path)[1]), expected, atol=1e-12)
+
+
+def test_colliding_and_short_trajectories_of_minari_are_left_out_and_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    good = demonstrations("large", 3)
+    through_walls = line((-4.5, 3), (4.5, -3), 300)
+    fragment = line((-4.5, 3), (-4.4, 3), 1)
+    folder = write_pointmaze(
+        tmp_path / "in", monkeypatch, [good[0], through_walls, good[1], fragment, good[2]]
+    )
+    n_written, dropped = write_maze_dataset(
+        read_minari(folder)[1], root=tmp_path / "d", repo_id="a/b", maze="large", origin="", n_steps=40
+    )
+    assert n_written == 3
+    assert dropped == {"in collision": 1, "shorter than 2 steps": 1}
+    dataset = LeRobotDataset("a/b", root=tmp_path / "d")
+    goals = [dataset[40 * number]["observation.environment_state"] for number in range(3)]
+    np.testing.assert_allclose(goals, [trajectory.goal for trajectory in good], rtol=1e-6)
+
+
+def test_a_missing_minari_folder_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=f"must be the folder of a Minari dataset, got {tmp_path}/no"):
+        read_minari(tmp_path / "no")
+
+
+def test_folders_that_hold_no_minari_dataset_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "foreign" / "data").mkdir(parents=True)
+    (tmp_path / "foreign" / "data" / "notes.txt").write_text("nothing")
+    (tmp_path / "empty").mkdir()
+    incomplete = write_pointmaze(tmp_path / "in", monkeypatch, demonstrations("umaze", 2))
+    shutil.copytree(incomplete, tmp_path / "no_metadata")
+    (tmp_path / "no_metadata" / "data" / "metadata.json").unlink()
+    (incomplete / "data" / "main_data.hdf5").unlink()
+    for folder in (tmp_path / "foreign", tmp_path / "empty", tmp_path / "no_metadata", incomplete):
+        with pytest.raises(
+            ValueError, match=f"{folder} must hold a Minari dataset, got one that cannot be read"
+        ):
+            read_minari(folder)
+
+
+def test_a_minari_file_that_is_cut_off_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = write_pointmaze(tmp_path, monkeypatch, demonstrations("umaze", 3))
+    path = folder / "data" / "main_data.hdf5"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises((ValueError, OSError), match=r"Minari|truncated"):
+        list(read_minari(folder)[1])
+
+
+def test_minari_datasets_of_other_environments_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    box = gym.spaces.Box(-1, 1, (3,))
+    folder = write_minari(tmp_path / "box", monkeypatch, [np.zeros((5, 3), np.float32)], box)
+    with pytest.raises(ValueError, match="must hold PointMaze episodes with achieved_goal and desired_goal"):
+        list(read_minari(folder)[1])
+    other = gym.spaces.Dict({"achieved_goal": box, "joints": box})
+    observation = {"achieved_goal": np.zeros((5, 3), np.float32), "joints": np.zeros((5, 3), np.float32)}
+    folder = write_minari(tmp_path / "other", monkeypatch, [observation], other)
+    with pytest.raises(ValueError, match="must hold PointMaze episodes with achieved_goal and desired_goal"):
+        list(read_minari(folder)[1])
+
+
+def test_minari_datasets_of_goals_in_space_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fetch = [Trajectory(np.zeros((6, 3)), np.ones(3))]
+    folder = write_pointmaze(tmp_path, monkeypatch, fetch, n_dims=3)
+    with pytest.raises(ValueError, match="must hold PointMaze episodes"):
+        list(read_minari(folder)[1])
+
+
+def test_minari_trajectories_that_are_not_finite_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    good = demonstrations("umaze", 2)
+    positions = good[1].positions.copy()
+    positions[3] = np.nan
+    folder = write_pointmaze(tmp_path / "in", monkeypatch, [good[0], Trajectory(positions, good[1].goal)])
+    with pytest.raises(ValueError, match="positions and goals must be finite, .* in episode 1"):
+        write_maze_dataset(
+            read_minari(folder)[1], root=tmp_path / "d", repo_id="a/b", maze="umaze", origin="", n_steps=10
+        )
