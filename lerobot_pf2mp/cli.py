@@ -104,7 +104,7 @@ class DemoConfig:
     # Demonstrations.
     n_demonstrations: int = 4000
     # Training steps of 64 trajectories.
-    steps: int = 2500
+    steps: int = 2000
     # Evaluation episodes for each policy.
     n_episodes: int = 500
     # Seed of demonstrations, training and evaluation.

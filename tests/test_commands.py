@@ -139,10 +139,10 @@ def test_ctrl_c_in_the_middle_of_collecting_leaves_nothing_behind(
         process.kill()
         process.wait()
     assert process.returncode == 130
-    assert output == ""
-    assert errors.strip().splitlines()[-1] == "interrupted: nothing half-written was left behind"
-    assert "Traceback" not in errors
     assert everything_in(tmp_path) == []
+    assert output == ""
+    assert "Traceback" not in errors
+    assert errors.strip().splitlines()[-1] == "interrupted: nothing half-written was left behind"
 
 
 @pytest.mark.slow
@@ -287,6 +287,7 @@ def test_convert_reads_minari_and_stops_at_the_number_asked_for(
         (["--source.path=good.hdf5", "--task=maze"], "error: task must be one of"),
         (["--source.path=good.hdf5", "--n_steps=0"], "error: n_steps must be at least 2, got 0"),
         (["--source.path=good.hdf5", "--n_episodes=0"], "error: n_episodes must be at least 1, got 0"),
+        (["--source.path=good.hdf5", "--n_episodes=many"], "error: `n_episodes`"),
         (["--source.path=foreign.hdf5"], f"error: a D4RL maze2d file must hold {FOREIGN_LAYOUT}"),
     ],
 )
