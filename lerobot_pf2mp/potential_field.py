@@ -74,9 +74,10 @@ class PotentialField:
 
     def to(self, device: torch.device | str) -> PotentialField:
         """This field with its anchors on `device`."""
-        if self.anchors.device == torch.device(device):
+        anchors = self.anchors.to(device)
+        if anchors is self.anchors:
             return self
-        return PotentialField(self.anchors.to(device), self.bandwidth, self.log_threshold, self.alpha)
+        return PotentialField(anchors, self.bandwidth, self.log_threshold, self.alpha)
 
     @torch.no_grad()
     def log_density(self, a: Tensor) -> Tensor:
@@ -181,7 +182,7 @@ class PotentialField:
 
     @cached_property
     def _centre(self) -> Tensor:
-        return self.anchors.double().mean(dim=0).float()  # (D,)
+        return _mean(self.anchors)  # (D,)
 
     @cached_property
     def _centred(self) -> Tensor:
@@ -277,7 +278,7 @@ def select_bandwidth(points: Tensor, rule: float | str = "likelihood") -> float:
         return float(rule)
     if rule not in BANDWIDTH_RULES:
         raise ValueError(f"bandwidth must be one of {BANDWIDTH_RULES} or a positive number, got {rule!r}")
-    variance = points.double().var(dim=0, correction=0)  # (D,)
+    variance = points.cpu().double().var(dim=0, correction=0)  # (D,)
     varying = variance > 0
     if not bool(varying.any()):
         return _SMALLEST_BANDWIDTH  # all points are the same one: there is no spread to measure
@@ -302,13 +303,13 @@ def leave_one_out_log_likelihood(points: Tensor, bandwidth: float) -> float:
         The mean leave-one-out log likelihood [nats].
     """
     count, dim = points.shape
-    centred = points.float() - points.double().mean(dim=0).float()
+    centred = points.float() - _mean(points)
     rows_per_block = max(1, _PAIRS_PER_BLOCK // count)
     total = 0.0
     for start in range(0, count, rows_per_block):
         log_kernels = _log_kernels(centred[start : start + rows_per_block], centred, bandwidth)
         log_kernels.diagonal(offset=start).fill_(-math.inf)
-        total += _log_sum_exp(log_kernels).double().sum().item()
+        total += _log_sum_exp(log_kernels).cpu().double().sum().item()
     log_normaliser = math.log(count - 1) + dim * (math.log(bandwidth) + 0.5 * math.log(2 * math.pi))
     return total / count - log_normaliser
 
@@ -355,6 +356,11 @@ def _log_kernels(queries: Tensor, anchors: Tensor, bandwidth: float) -> Tensor:
             difference = q.unsqueeze(1) - x.unsqueeze(0)  # (Q, M)
             squares.addcmul_(difference, difference)
         return squares.neg_()
+
+
+def _mean(points: Tensor) -> Tensor:
+    """The mean ``(D,)`` of points ``(M, D)`` in double precision, which not every device has, as float32."""
+    return points.cpu().double().mean(dim=0).float().to(points.device)
 
 
 def _log_sum_exp(log_kernels: Tensor) -> Tensor:

@@ -134,11 +134,14 @@ class DemonstratedActions:
             keep = keep & (ranks < self._ranks[settings.n_points - 1].to(ranks.device))
         self._merge(ranks[keep], actions[keep])
 
-    def field(self, settings: FieldSettings | None = None) -> PotentialField:
+    def field(
+        self, settings: FieldSettings | None = None, device: torch.device | str = "cpu"
+    ) -> PotentialField:
         """The potential field of the frames shown so far.
 
         Args:
             settings: What to fit with; None for the settings of training.
+            device: Where the field is needed; it stays there until it is asked for elsewhere.
 
         Returns:
             The field, fitted when first asked for.
@@ -164,19 +167,20 @@ class DemonstratedActions:
                 )
             else:
                 field = potential_field.fit(
-                    self._points[: settings.n_points],
+                    self._points[: settings.n_points].cpu(),
                     bandwidth=settings.bandwidth,
                     threshold_quantile=settings.threshold_quantile,
                     alpha=settings.alpha,
                 )
             self._fitted = (settings, field)
+        self._fitted = (settings, self._fitted[1].to(device))
         return self._fitted[1]
 
     def state_dict(self) -> dict[str, Tensor]:
         """The sample and the fitted field as CPU tensors; empty before anything was shown."""
         if not len(self):
             return {}
-        field = self.field(self.settings)
+        field = self.field()
         return {
             "points": self._points.cpu().contiguous(),
             "ranks": self._ranks.cpu().contiguous(),

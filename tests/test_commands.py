@@ -276,7 +276,7 @@ def test_convert_reads_minari_and_stops_at_the_number_asked_for(
         ),
         (["--source.path=text.hdf5"], "error: text.hdf5 must be a whole HDF5 file"),
         (
-            ["--source.path=no", "--source.type=minari"],
+            ["--source.path=gone", "--source.type=minari"],
             "error: source.path must be the folder of a Minari dataset",
         ),
         (["--source.path=.", "--source.type=minari"], "error: . must hold a Minari dataset"),

@@ -10,6 +10,7 @@ from lerobot.policies.factory import get_policy_class
 from torch import Tensor
 
 from lerobot_pf2mp import FMPConfig, PF2MPConfig, PotentialFieldProcessorStep
+from lerobot_pf2mp.errors import ConfigError
 from lerobot_pf2mp.policies.fmp.modeling_fmp import FMPPolicy
 from lerobot_pf2mp.policies.pf2mp.modeling_pf2mp import PF2MPPolicy
 from lerobot_pf2mp.potential_field_processor import POTENTIAL_FIELD, DemonstratedActions
@@ -807,7 +808,7 @@ def test_options_on_the_command_line_reach_the_configuration(tmp_path):
 )
 @pytest.mark.parametrize("make_config", [FMPConfig, PF2MPConfig])
 def test_values_that_break_their_rule_are_an_error(make_config, options, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ConfigError, match=message):
         make_config(**{**SMALL, **options})
 
 
@@ -833,7 +834,7 @@ def test_values_that_break_their_rule_are_an_error(make_config, options, message
     ],
 )
 def test_guidance_and_field_values_that_break_their_rule_are_an_error(options, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ConfigError, match=message):
         PF2MPConfig(**SMALL, **options)
 
 

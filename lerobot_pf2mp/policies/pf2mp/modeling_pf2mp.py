@@ -64,7 +64,7 @@ class PF2MPPolicy(FMPPolicy):
                 f"guidance needs the potential field, which the policy's own preprocessor puts under {POTENTIAL_FIELD!r}; "
                 "got a batch without it. Load the preprocessor from the checkpoint, or set guidance_scale=0"
             )
-        field = demonstrations.field(self.config.field_settings).to(next(self.parameters()).device)
+        field = demonstrations.field(self.config.field_settings, next(self.parameters()).device)
         dims = self.config.field_action_dims
         n_dims = self.config.action_feature.shape[0] if dims is None else len(dims)
         if field.dim != n_dims:
