@@ -33,7 +33,7 @@ def read_d4rl(path: Path, maze: str) -> list[Trajectory]:
         FileNotFoundError: If there is no such file.
         ValueError: If it is not a whole HDF5 file of D4RL's layout, or holds NaN or infinity.
     """
-    observations, goals, timeouts = _read(Path(path))
+    observations, goals, timeouts = _read(Path(path).expanduser())
     rows = parse_maze_map(maze)
     new_goal = np.abs(np.diff(goals, axis=0)).max(axis=1, initial=0) > _SAME_GOAL
     ends = np.flatnonzero(new_goal | timeouts[:-1]) + 1
@@ -48,7 +48,7 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         raise FileNotFoundError(f"source.path must be an HDF5 file, got {path}, which does not exist")
     try:
         with h5py.File(path) as file:
-            missing = [key for key in ("observations", "infos/goal") if key not in file]
+            missing = [key for key in ("observations", "infos/goal") if not _is_column(file.get(key))]
             if missing:
                 raise ValueError(
                     f"a D4RL maze2d file must hold observations and infos/goal, got {sorted(file)} in {path}; "
@@ -64,9 +64,9 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             f"observations must have shape (N, 4) and infos/goal (N, 2), got {observations.shape} and {goals.shape} "
             f"in {path}"
         )
-    if len(timeouts) != len(observations) or len(observations) < 1:
+    if timeouts.shape != (len(observations),) or len(observations) < 1:
         raise ValueError(
-            f"timeouts must have one entry for each of N >= 1 observations, got {len(timeouts)} for "
+            f"timeouts must have one entry for each of N >= 1 observations, got {timeouts.shape} for "
             f"{len(observations)} in {path}"
         )
     for name, values in (("observations", observations), ("infos/goal", goals)):
@@ -74,6 +74,10 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         if bad.any():
             raise ValueError(f"{name} must be finite, got NaN or infinity in row {bad.argmax()} of {path}")
     return observations, goals, timeouts
+
+
+def _is_column(entry: object) -> bool:
+    return isinstance(entry, h5py.Dataset) and entry.ndim > 0
 
 
 def _to_environment(positions: np.ndarray, rows: list[list[int]]) -> np.ndarray:

@@ -49,5 +49,10 @@ def _trajectories(dataset: object, path: Path) -> Iterator[Trajectory]:
             )
         positions = np.asarray(observations["achieved_goal"], dtype=np.float64)
         goals = np.asarray(observations["desired_goal"], dtype=np.float64)
+        if positions.ndim != 2 or positions.shape[1] != 2 or goals.shape != positions.shape:
+            raise ValueError(
+                f"{path} must hold PointMaze episodes, positions and goals in the plane, got {positions.shape} and "
+                f"{goals.shape}"
+            )
         # The first desired goal is the previous episode's: PointMaze draws the new one after it is recorded.
         yield Trajectory(positions, goals[min(1, len(goals) - 1)])

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -57,18 +56,34 @@ def written_beside(root: Path, overwrite: bool) -> Iterator[Path]:
         FileExistsError: If `root` exists and `overwrite` is false.
     """
     root = Path(root)
-    if root.exists() and not overwrite:
-        raise FileExistsError(f"{root} exists already: choose another --root, or pass --overwrite=true")
+    if root.exists():
+        if not overwrite:
+            raise FileExistsError(f"{root} exists already: choose another --root, or pass --overwrite=true")
+        if not (root / "meta/info.json").is_file():
+            raise FileExistsError(
+                f"{root} is not a dataset and will not be overwritten: choose another --root"
+            )
     root.parent.mkdir(parents=True, exist_ok=True)
     workspace = Path(tempfile.mkdtemp(prefix=f".{root.name}.", suffix=".partial", dir=root.parent))
     try:
         partial = workspace / "new"
         yield partial
-        if root.exists():
-            root.rename(workspace / "old")
-        os.replace(partial, root)  # noqa: PTH105 (names what it does to both)
+        _swap(partial, root, spare=workspace / "old")
     finally:
         shutil.rmtree(workspace, ignore_errors=True)
+
+
+def _swap(new: Path, root: Path, spare: Path) -> None:
+    """Puts `new` in the place of `root`; if that fails, `root` is as before."""
+    if not root.exists():
+        new.rename(root)
+        return
+    root.rename(spare)
+    try:
+        new.rename(root)
+    except BaseException:
+        spare.rename(root)
+        raise
 
 
 def write_dataset(
@@ -103,10 +118,16 @@ def write_dataset(
         )
         meta.save_episode_tasks([spec.task])
         all_stats = []
-        with _FrameFiles(meta) as files:
-            for episode in episodes:
-                _check(episode, spec.features, meta.total_episodes)
-                all_stats.append(_write_episode(meta, files, episode, spec.task))
+        try:
+            with _FrameFiles(meta) as files:
+                for episode in episodes:
+                    _check(episode, spec.features, meta.total_episodes)
+                    all_stats.append(_write_episode(meta, files, episode, spec.task))
+        except BaseException:
+            # Otherwise the metadata would write its last episodes when it is garbage-collected, folder or not.
+            meta._metadata_buffer.clear()
+            meta.finalize()
+            raise
         n_episodes = meta.total_episodes
         if n_episodes == 0:
             raise ValueError("a dataset must hold at least one episode, got none that is usable")

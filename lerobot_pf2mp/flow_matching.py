@@ -76,11 +76,14 @@ def flow_matching_loss(
         x_0: ``(B, T, A)`` noise.
         x_1: ``(B, T, A)`` demonstrated chunks.
         t: ``(B,)`` times in [0, 1].
-        is_pad: ``(B, T)`` true where the chunk is padding, where the loss is zero.
+        is_pad: ``(B, T)`` true where the chunk is padding: the loss is zero there and the padding's values are not used.
 
     Returns:
         ``(B, T)`` losses.
     """
+    if is_pad is not None:
+        # LeRobot pads with copies of the last action, from which the network could read where the chunk ends.
+        x_1 = x_1.masked_fill(is_pad.unsqueeze(-1), 0.0)
     path = sample_path(x_0, x_1, t)
     loss = (velocity(path.x_t, t) - path.velocity).square().mean(dim=-1)  # (B, T)
     return loss if is_pad is None else loss.masked_fill(is_pad, 0.0)

@@ -19,6 +19,8 @@ from torch import Tensor
 from lerobot_pf2mp.flow_matching import Guide
 from lerobot_pf2mp.potential_field import PotentialField
 
+_TINY = torch.finfo(torch.float32).tiny
+
 GUIDANCE_INTEGRATORS = ("euler", "proximal")
 
 
@@ -59,13 +61,12 @@ class ProximalGuide:
     def __call__(self, x_t: Tensor, x_next: Tensor, dt: float) -> Tensor:
         """The guided step from the unguided one, all ``(..., D)`` [normalised]."""
         decay = math.exp(-self.scale * dt / self.field.bandwidth**2)
-        mean = self.field.local_mean(x_next)
-        guided = mean + (x_next - mean) * decay
+        guided = x_next + (1 - decay) * self.field.mean_shift(x_next)
         if self.field.alpha != 0:
             offset = self.field.offset_to_safe_set(guided)
             distance = offset.norm(dim=-1, keepdim=True)
             reach = self.scale * -self.field.alpha * dt
-            guided = guided + offset * (reach / distance.clamp_min(reach))
+            guided = guided + offset * (reach / distance.clamp_min(max(reach, _TINY)))
         return guided
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import torch
 from lerobot.datasets.feature_utils import get_delta_indices
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -29,7 +30,10 @@ class InMemoryDataset(torch.utils.data.Dataset):
             raise ValueError(f"an in-memory dataset must be numeric, got {dataset.meta.features}")
         self._dataset = dataset
         table = dataset.hf_dataset.with_format("arrow")[:]
-        self._columns = {key: _to_tensor(table.column(key)) for key in table.column_names}
+        features = dataset.meta.features
+        self._columns = {
+            key: _to_tensor(table.column(key), features[key]["shape"]) for key in table.column_names
+        }
         self._tasks = list(dataset.meta.tasks.index)
         self._task_of_row = self._columns["task_index"].tolist()
         windows = get_delta_indices(dataset.delta_timestamps or {}, dataset.meta.fps)
@@ -58,6 +62,7 @@ class InMemoryDataset(torch.utils.data.Dataset):
     def __getitems__(self, rows: list[int]) -> list[dict[str, Any]]:
         """The samples of several rows; a DataLoader asks for whole batches here."""
         index = torch.as_tensor(rows)
+        index = torch.where(index < 0, index + len(self), index)
         batch = {key: column[index] for key, column in self._columns.items() if key not in self._windows}
         first, last = self._episode_start[index, None], self._episode_end[index, None] - 1
         for key, deltas in self._windows.items():
@@ -66,7 +71,7 @@ class InMemoryDataset(torch.utils.data.Dataset):
             batch[key] = self._columns[key][wanted.clamp(first, last)]
         keys = list(batch)
         samples = [dict(zip(keys, values, strict=True)) for values in zip(*batch.values(), strict=True)]
-        for row, sample in zip(rows, samples, strict=True):
+        for row, sample in zip(index.tolist(), samples, strict=True):
             sample["task"] = self._tasks[self._task_of_row[row]]
         return samples
 
@@ -91,13 +96,18 @@ def _is_numeric(dataset: LeRobotDataset) -> bool:
     )
 
 
-def _to_tensor(column: Any) -> Tensor:
-    """A column of an Arrow table as a tensor ``(N, ...)``, in the type that LeRobot's reader gives it."""
+def _to_tensor(column: Any, feature_shape: tuple[int, ...]) -> Tensor:
+    """A column of an Arrow table as a tensor ``(N, *feature_shape)``, in the type that LeRobot's reader gives it."""
     values = column.combine_chunks()
-    shape = [len(values)]
-    while hasattr(values.type, "list_size"):
-        shape.append(values.type.list_size)
+    n_rows = len(values)
+    if isinstance(values.type, pa.ExtensionType):
+        values = values.storage
+    while pa.types.is_nested(values.type):
         values = values.flatten()
-    array = torch.from_numpy(values.to_numpy(zero_copy_only=False).copy()).reshape(shape)
-    # LeRobot goes through Python numbers: floats arrive as float32.
-    return array.float() if array.is_floating_point() else array
+    array = torch.from_numpy(values.to_numpy(zero_copy_only=False).copy())
+    if tuple(feature_shape) != (1,):  # LeRobot stores vectors of length one as numbers
+        array = array.reshape(n_rows, *feature_shape)
+    # LeRobot goes through Python numbers, so that precision does not survive.
+    if array.dtype == torch.bool:
+        return array
+    return array.float() if array.is_floating_point() else array.long()

@@ -27,6 +27,9 @@ BANDWIDTH_RULES = ("scott", "silverman", "likelihood")
 # Pairs (query, anchor) held at once: 2^20 float32 numbers, 4 MB, stay in a core's cache.
 _PAIRS_PER_BLOCK = 2**20
 
+# The root of float32's largest number, with room for a sum of a thousand squares.
+_LARGEST = 5e17
+
 # Relative to the spread of the points. Below it a float32 kernel resolves nothing but duplicates.
 _SMALLEST_BANDWIDTH = 1e-3
 
@@ -94,20 +97,27 @@ class PotentialField:
         return (torch.cat(log_sums) - self._log_normaliser).reshape(a.shape[:-1])
 
     @torch.no_grad()
-    def local_mean(self, a: Tensor) -> Tensor:
-        """The kernel-weighted mean m(a) of the anchors, to which grad log p(a) points (mean shift).
+    def mean_shift(self, a: Tensor) -> Tensor:
+        """The vector m(a) - a to the kernel-weighted mean m(a) of the anchors, along which log p(a) rises.
 
         Args:
             a: ``(..., D)`` actions [normalised].
 
         Returns:
-            ``(..., D)`` local means [normalised], inside the convex hull of the anchors.
+            ``(..., D)`` offsets [normalised]; m(a) lies in the convex hull of the anchors.
         """
         queries = self._flatten(a)
-        means = [
-            torch.softmax(self._log_kernels(block), dim=-1) @ self._centred for block in self._blocks(queries)
-        ]
-        return (torch.cat(means) + self._centre).reshape(a.shape)
+        # Autocast would multiply in bfloat16.
+        with torch.autocast(device_type=queries.device.type, enabled=False):
+            shifts = [
+                torch.softmax(self._log_kernels(block), dim=-1) @ self._centred - (block - self._centre)
+                for block in self._blocks(queries)
+            ]
+        return torch.cat(shifts).reshape(a.shape)
+
+    def local_mean(self, a: Tensor) -> Tensor:
+        """The kernel-weighted mean m(a) of the anchors, ``(..., D)`` for actions ``(..., D)`` [normalised]."""
+        return a.float() + self.mean_shift(a)
 
     @torch.no_grad()
     def score(self, a: Tensor) -> Tensor:
@@ -119,7 +129,7 @@ class PotentialField:
         Returns:
             ``(..., D)`` scores [1/normalised].
         """
-        return (self.local_mean(a) - a.float()) / self.bandwidth**2
+        return self.mean_shift(a) / self.bandwidth**2
 
     @torch.no_grad()
     def offset_to_safe_set(self, a: Tensor) -> Tensor:
@@ -289,7 +299,9 @@ def select_bandwidth(points: Tensor, rule: float | str = "likelihood") -> float:
         return scott
     if rule == "silverman":
         return scott * (4 / (dim + 2)) ** (1 / (dim + 4))
-    return _most_likely_bandwidth(points, smallest=_SMALLEST_BANDWIDTH * spread, largest=3 * spread)
+    return _most_likely_bandwidth(
+        points.cpu()[:, varying], smallest=_SMALLEST_BANDWIDTH * spread, largest=3 * spread
+    )
 
 
 def leave_one_out_log_likelihood(points: Tensor, bandwidth: float) -> float:
@@ -350,7 +362,9 @@ def _log_kernels(queries: Tensor, anchors: Tensor, bandwidth: float) -> Tensor:
     """
     with torch.autocast(device_type=queries.device.type, enabled=False):
         scale = 1 / (math.sqrt(2) * bandwidth)
-        scaled_queries, scaled_anchors = queries * scale, anchors * scale
+        # Beyond the limit squares would overflow, and the softmax with them; there the nearest anchor is unknowable.
+        scaled_queries = (queries * scale).clamp(-_LARGEST, _LARGEST)
+        scaled_anchors = (anchors * scale).clamp(-_LARGEST, _LARGEST)
         squares = torch.zeros(len(queries), len(anchors), dtype=torch.float32, device=queries.device)
         for q, x in zip(scaled_queries.unbind(-1), scaled_anchors.unbind(-1), strict=True):
             difference = q.unsqueeze(1) - x.unsqueeze(0)  # (Q, M)

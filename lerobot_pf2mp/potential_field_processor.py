@@ -215,6 +215,12 @@ class DemonstratedActions:
             raise ValueError(
                 f"the potential field file must cover the action dimensions {dims}, got points of {points.shape[1]}"
             )
+        for name in ("n_shown", "bandwidth", "log_threshold"):
+            if state[name].numel() != 1:
+                raise ValueError(
+                    f"{name} in a potential field file must be one number, got {tuple(state[name].shape)}: "
+                    "it is corrupted"
+                )
         self._points, self._ranks = points.float(), ranks
         self._n_shown = int(state["n_shown"])
         self._dataset_id = bytes(state["dataset_id"].tolist())

@@ -216,7 +216,7 @@ def test_files_that_are_not_whole_hdf5_files_are_refused(
         ({"observations": np.zeros((9, 4))}, r"infos/goal \(N, 2\), got \(9, 4\) and \(10, 2\)"),
         ({"infos__goal": np.zeros((10, 3))}, r"infos/goal \(N, 2\), got \(10, 4\) and \(10, 3\)"),
         ({"infos__goal": np.zeros((0, 2)), "observations": np.zeros((0, 4))}, "timeouts must have one entry"),
-        ({"timeouts": np.zeros(9, bool)}, "timeouts must have one entry .* got 9 for 10"),
+        ({"timeouts": np.zeros(9, bool)}, "timeouts must have one entry .* got \\(9,\\) for 10"),
         ({"timeouts": np.zeros((10, 2), bool)}, "timeouts must have one entry"),
         ({"observations": np.full((10, 4), np.nan)}, "observations must be finite, .* in row 0"),
         (
@@ -240,12 +240,12 @@ def test_hdf5_files_with_groups_or_numbers_for_columns_are_refused(tmp_path: Pat
     )
     with h5py.File(path, "a") as file:
         file.create_group("observations").create_dataset("achieved_goal", data=np.zeros((10, 2)))
-    with pytest.raises(ValueError, match="observations"):
+    with pytest.raises(ValueError, match=r"observations|a\.hdf5"):
         read_d4rl(path, LOPSIDED)
     with h5py.File(path, "a") as file:
         del file["observations"]
         file["observations"] = 3.0
-    with pytest.raises(ValueError, match=r"observations|scalar"):
+    with pytest.raises(ValueError, match=r"observations|a\.hdf5|scalar"):
         read_d4rl(path, LOPSIDED)
 
 

@@ -421,10 +421,14 @@ def test_a_dataset_survives_when_its_replacement_cannot_take_its_place(tmp_path:
     write_dataset(tmp_path / "d", SPEC, toy_episodes(2))
     before = contents_of(tmp_path)
 
-    def fail(*_: object) -> None:
-        raise OSError(5, "Input/output error")
+    rename = Path.rename
 
-    monkeypatch.setattr(os, "replace", fail)
+    def fail_for_the_new_one(path: Path, target: Path) -> Path:
+        if path.name == "new":
+            raise OSError(5, "Input/output error")
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", fail_for_the_new_one)
     with pytest.raises(OSError, match="Input/output error"):
         write_dataset(tmp_path / "d", SPEC, toy_episodes(3), overwrite=True)
     gc.collect()
@@ -461,7 +465,7 @@ def test_a_dataset_is_replaced_when_asked_for(tmp_path: Path) -> None:
 def test_a_folder_that_is_no_dataset_is_never_replaced(tmp_path: Path) -> None:
     (tmp_path / "home").mkdir()
     (tmp_path / "home" / "thesis.tex").write_text("years of work")
-    with pytest.raises((ValueError, FileExistsError), match=r"no.* dataset"):
+    with pytest.raises((ValueError, FileExistsError), match=r"(?i)no.* dataset"):
         write_dataset(tmp_path / "home", SPEC, toy_episodes(2), overwrite=True)
     assert everything_in(tmp_path) == ["home", "home/thesis.tex"]
 

@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+import itertools
 import re
 import tempfile
 import warnings
@@ -27,6 +28,7 @@ from lerobot_pf2mp.envs.maze import (
     make_point_maze,
     parse_maze_map,
 )
+from lerobot_pf2mp.errors import ConfigError
 
 CONTROLS = ("exact", "pd")
 RING = "11111/10001/10101/10001/11111"  # one block, [-0.5, 0.5] m on both axes, in the middle
@@ -156,6 +158,11 @@ def test_a_step_from_free_space_to_free_space_over_a_thin_corner_is_caught() -> 
     assert swept_ball(RING, 0.0).clearance(start, end) < 0
 
 
+def test_clearances_in_a_wide_room_are_distances_too() -> None:
+    room = "/".join(["1" * 9, *["1" + "0" * 7 + "1"] * 7, "1" * 9])
+    assert swept_ball(room).clearance(np.zeros(2), np.zeros(2)) == pytest.approx(3.5 - 0.1, abs=1.2e-5)
+
+
 def test_a_step_is_as_clear_backwards() -> None:
     ball = swept_ball("medium")
     for start, end in segments("medium", 0.5, 50):
@@ -180,7 +187,7 @@ def test_a_path_collides_where_its_clearance_is_negative(maze_map: str) -> None:
 def test_the_clearance_of_a_path_is_that_of_its_worst_step() -> None:
     ball = swept_ball(RING)
     path = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, 1.2], [1.2, 1.2]])
-    steps = [ball.clearance(start, end) for start, end in zip(path[:-1], path[1:], strict=True)]
+    steps = [ball.clearance(start, end) for start, end in itertools.pairwise(path)]
     assert ball.path_clearance(path) == min(steps)
     assert min(steps) == pytest.approx(1.5 - 1.2 - 0.1)
 
@@ -405,6 +412,18 @@ def test_a_pd_ball_cannot_enter_a_wall() -> None:
         assert distance_to_walls(position, position, walls) > BALL_RADIUS - 0.05
         assert info["clearance"] > -0.05
     assert info["is_collision"]
+
+
+def test_a_wall_touched_and_left_again_within_one_step_is_a_collision() -> None:
+    env = MazeEnv(CORRIDOR, control="pd", fps=1)
+    env.reset(seed=0, options={"start": (-2.0, 0.0), "goal": (2.0, 0.0)})
+    before, _, _, _, info = env.step(np.array([2.2, 0.0]))  # 0.2 m before the wall at 4 m/s
+    assert not info["is_collision"]
+    after, reward, _, _, info = env.step(np.array([0.0, 0.0]))
+    straight_way = np.array([before["agent_pos"], after["agent_pos"]], dtype=np.float64)
+    assert swept_ball(CORRIDOR).path_clearance(straight_way) > 0.05
+    assert info["is_collision"]
+    assert reward == -1
 
 
 @pytest.mark.parametrize("control", CONTROLS)
@@ -647,7 +666,9 @@ def test_the_features_of_a_policy_are_state_goal_and_action() -> None:
 
 @pytest.mark.parametrize("task", ["MazeHuge-v0", "maze_large", None, ""])
 def test_a_task_that_does_not_exist_is_refused(task: str | None) -> None:
-    with pytest.raises(ValueError, match=f"task must be one of .*MazeUMaze-v0.* got {re.escape(repr(task))}"):
+    with pytest.raises(
+        ConfigError, match=f"task must be one of .*MazeUMaze-v0.* got {re.escape(repr(task))}"
+    ):
         PF2MPMazeEnv(task=task)
 
 

@@ -541,24 +541,23 @@ def test_settings_changed_at_evaluation_take_effect():
 # What the field learns from.
 
 
-@pytest.mark.parametrize("n_obs_steps", [1, 2])
-def test_the_field_holds_every_action_that_training_saw_once(n_obs_steps):
-    policy = pf2mp(n_obs_steps=n_obs_steps, n_field_points=1000).train()
+def test_the_field_holds_every_action_that_training_saw_once_whatever_is_observed():
     episode = torch.randn(30, ACTION_DIM)
-    field = DemonstratedActions(policy.config.field_settings)
-    for frames in torch.randperm(30).repeat(2).split(6):
-        wanted = frames.unsqueeze(1) + torch.tensor(policy.config.action_delta_indices)
-        batch = {
-            **observations(policy, 6, n_obs_steps),
-            ACTION: episode[wanted.clamp(0, 29)],
-            "action_is_pad": (wanted < 0) | (wanted > 29),
-            "index": frames,
-            POTENTIAL_FIELD: field,
-        }
-        policy(batch)
-    assert len(field) == 30
-    points = field.field().anchors
-    assert torch.equal(points.sort(dim=0).values, episode.sort(dim=0).values)
+    field = DemonstratedActions(PF2MPConfig(**SMALL).field_settings)
+    for n_obs_steps in (1, 2):
+        policy = pf2mp(n_obs_steps=n_obs_steps).train()
+        for frames in torch.randperm(30).split(6):
+            wanted = frames.unsqueeze(1) + torch.tensor(policy.config.action_delta_indices)
+            batch = {
+                **observations(policy, 6, n_obs_steps),
+                ACTION: episode[wanted.clamp(0, 29)],
+                "action_is_pad": (wanted < 0) | (wanted > 29),
+                "index": frames,
+                POTENTIAL_FIELD: field,
+            }
+            policy(batch)
+        assert len(field) == 30
+        assert torch.equal(field.field().anchors.sort(dim=0).values, episode.sort(dim=0).values)
 
 
 @pytest.mark.parametrize("held_out", ["eval", "no_grad"])

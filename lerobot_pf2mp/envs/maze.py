@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -30,6 +31,9 @@ MAX_SPEED = 5.0  # [m/s] for each axis, PointMaze's own limit
 # What a clearance is looked for within [m]; nothing in a maze of unit cells is farther from a wall.
 _CLEARANCE_RANGE = 2.0
 _TALL_WALL = 10.0  # half height [m]
+# MuJoCo's distance between a capsule and a box looks at the capsule's ends: where the whole of a long one crosses the box
+# in the middle, it finds none. Short pieces are measured to within 1e-6 m.
+_LONGEST_PIECE = 0.25  # [m]
 # MuJoCo's distance to a box is wrong for capsules of no length at all.
 _SHORTEST_HALF_LENGTH = 1e-5
 
@@ -132,6 +136,12 @@ class SweptBall:
             start: ``(2,)`` position of its centre before [m].
             end: ``(2,)`` position after [m].
         """
+        n_pieces = max(1, math.ceil(math.dist(start, end) / _LONGEST_PIECE))
+        return min(
+            self._clearance_of_piece(*piece) for piece in pairwise(np.linspace(start, end, n_pieces + 1))
+        )
+
+    def _clearance_of_piece(self, start: np.ndarray, end: np.ndarray) -> float:
         low, high = np.minimum(start, end), np.maximum(start, end)
         # The gap between bounding boxes bounds the distance from below: measure the walls in that order.
         gaps = np.maximum(self._centres - self._half_sizes - high, low - self._centres - self._half_sizes)

@@ -121,7 +121,7 @@ class FMPConfig(PreTrainedConfig):
             self._validate()
 
     def _validate(self) -> None:
-        for name in ("n_obs_steps", "horizon", "n_action_steps", "num_inference_steps"):
+        for name in ("n_obs_steps", "horizon", "n_action_steps", "num_inference_steps", "n_groups"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         most_actions = self.horizon - self.n_obs_steps + 1
