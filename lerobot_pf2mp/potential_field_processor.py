@@ -245,8 +245,10 @@ class DemonstratedActions:
         ranks, order = ranks.sort(stable=True)
         is_first = torch.ones_like(ranks, dtype=torch.bool)
         is_first[1:] = ranks[1:] != ranks[:-1]  # the hash is one to one: an equal rank is the same frame
-        self._ranks = ranks[is_first][: self.settings.n_points]
-        self._points = points[order][is_first][: self.settings.n_points]
+        ranks = ranks[is_first][: self.settings.n_points]
+        if torch.equal(ranks, self._ranks.to(ranks.device)):
+            return  # nothing new: the fitted field stands
+        self._ranks, self._points = ranks, points[order][is_first][: self.settings.n_points]
         self._fitted = None
 
 

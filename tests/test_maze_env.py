@@ -130,7 +130,7 @@ def test_the_clearance_of_a_jump_over_whole_walls_is_negative(radius: float) -> 
     for start, end in [([0.7, 0.0], [-0.7, 0.0]), ([0.3, 0.61], [0.3, -1.0]), ([0.67, 0.34], [-0.62, 0.27])]:
         assert swept_ball(RING, radius).clearance(np.array(start), np.array(end)) < 0
     for length in (1.0, 2.0, 4.0):
-        pairs = segments("large", length, 400)
+        pairs = segments("large", length, 150)
         assert_agrees_with_the_distance(swept_ball("large", radius), radius, "large", pairs)
 
 
