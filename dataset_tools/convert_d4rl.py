@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 from lerobot_pf2mp.dataset_tools.episodes import Trajectory
 
-from lerobot_pf2mp.envs.maze import parse_maze_map
+from lerobot_pf2mp.envs.point_maze import parse_maze_map
 
 # In D4RL's model the walls of cell (i, j) are centred at (i + 1, j + 1) and the ball's joints start at (1.2, 1.2).
 _CELL_OFFSET = 1.2 - 1.0

@@ -13,7 +13,8 @@ from lerobot_pf2mp.dataset_tools.episodes import Trajectory, prepare
 from lerobot_pf2mp.dataset_tools.lerobot_writer import DatasetSpec, write_dataset
 from tqdm import tqdm
 
-from lerobot_pf2mp.envs.maze import BALL_RADIUS, SweptBall, make_point_maze
+from lerobot_pf2mp.envs.point_maze import BALL_RADIUS, make_point_maze
+from lerobot_pf2mp.envs.swept_ball import SweptBall
 
 FPS = 10
 TASK_DESCRIPTION = "Move the ball to the red goal without touching a wall."
@@ -44,7 +45,7 @@ Every trajectory is resampled to {n_steps} steps by linear interpolation in time
 | `action` | next position x, y of the ball | m |
 
 The origin is the centre of the map, x points east and y north; cells have sides of 1 m, the ball a radius of 0.1 m.
-Made with [lerobot_policy_pf2mp](https://pypi.org/project/lerobot_policy_pf2mp/).
+Made with lerobot_policy_pf2mp.
 """
 
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 from lerobot_pf2mp.dataset_tools.episodes import Trajectory
 
-from lerobot_pf2mp.envs.maze import make_point_maze, step_physics
+from lerobot_pf2mp.envs.point_maze import make_point_maze, step_physics
 
 WAYPOINT_RADIUS = 0.1  # [m] a waypoint counts as reached, as in D4RL
 WAYPOINT_JITTER = 0.1  # [m] waypoints lie this far off the cell centres at most, on both axes

@@ -20,7 +20,8 @@ from lerobot_pf2mp.benchmark import Result, write_results
 from lerobot_pf2mp.dataset_tools.collect_maze import collect_maze
 from lerobot_pf2mp.dataset_tools.maze_dataset import maze_of
 from lerobot_pf2mp.envs import MAZE_TASKS
-from lerobot_pf2mp.envs.maze import BALL_RADIUS, SweptBall, make_point_maze
+from lerobot_pf2mp.envs.point_maze import BALL_RADIUS, make_point_maze
+from lerobot_pf2mp.envs.swept_ball import SweptBall
 from lerobot_pf2mp.loading import load_policy
 from lerobot_pf2mp.plots import MazePath, plot_maze_overview
 from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig

@@ -19,7 +19,8 @@ from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 from torch import Tensor
 
 from lerobot_pf2mp import potential_field
-from lerobot_pf2mp.potential_field import BANDWIDTH_RULES, PotentialField
+from lerobot_pf2mp.kernel_density import BANDWIDTH_RULES
+from lerobot_pf2mp.potential_field import PotentialField
 
 POTENTIAL_FIELD = "potential_field"
 

@@ -111,9 +111,9 @@ def test_help_shows_examples_units_and_defaults(command: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("wait_for_frames", [False, True])
+@pytest.mark.parametrize("metadata_begun", [False, True])
 def test_ctrl_c_in_the_middle_of_collecting_leaves_nothing_behind(
-    tmp_path: Path, wait_for_frames: bool
+    tmp_path: Path, metadata_begun: bool
 ) -> None:
     process = subprocess.Popen(
         [BIN / "pf2mp-collect", "--n_episodes=4000", f"--root={tmp_path / 'd'}"],
@@ -126,7 +126,7 @@ def test_ctrl_c_in_the_middle_of_collecting_leaves_nothing_behind(
         end = time.monotonic() + SECONDS
         # Interrupt it as soon as the first frames are written, or after more than the 100 episodes that are buffered.
         under_way = (
-            "new/meta/episodes/chunk-000/*.parquet" if wait_for_frames else "new/data/chunk-000/*.parquet"
+            "new/meta/episodes/chunk-000/*.parquet" if metadata_begun else "new/data/chunk-000/*.parquet"
         )
         while not any(tmp_path.glob(f".d.*.partial/{under_way}")):
             assert process.poll() is None, process.communicate()

@@ -16,7 +16,7 @@ from lerobot_pf2mp.dataset_tools.episodes import Trajectory, resample
 from lerobot_pf2mp.dataset_tools.maze_dataset import write_maze_dataset
 from lerobot_pf2mp.dataset_tools.maze_expert import MazeExpert
 
-from lerobot_pf2mp.envs.maze import parse_maze_map
+from lerobot_pf2mp.envs.point_maze import parse_maze_map
 
 LOPSIDED = (
     "1111111/1000001/1111101/1110001/1111111"  # tells rows from columns, north from south, east from west

@@ -20,7 +20,9 @@ from lerobot_pf2mp.dataset_tools.lerobot_writer import DatasetSpec, write_datase
 from lerobot_pf2mp.dataset_tools.maze_dataset import MAZE_OF_TASK, maze_of, write_maze_dataset
 from lerobot_pf2mp.dataset_tools.maze_expert import MazeExpert
 
-from lerobot_pf2mp.envs.maze import BALL_RADIUS, SUCCESS_RADIUS, SweptBall, make_point_maze
+from lerobot_pf2mp.envs.maze import SUCCESS_RADIUS
+from lerobot_pf2mp.envs.point_maze import BALL_RADIUS, make_point_maze
+from lerobot_pf2mp.envs.swept_ball import SweptBall
 
 CORRIDOR = "1111111/1000001/1111111"
 SPEC = DatasetSpec(

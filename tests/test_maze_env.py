@@ -20,14 +20,9 @@ from lerobot_pf2mp.dataset_tools.maze_expert import MazeExpert
 from torch import nn
 
 from lerobot_pf2mp.envs import MAZE_TASKS, PF2MPMazeEnv
-from lerobot_pf2mp.envs.maze import (
-    BALL_RADIUS,
-    MAZE_MAPS,
-    MazeEnv,
-    SweptBall,
-    make_point_maze,
-    parse_maze_map,
-)
+from lerobot_pf2mp.envs.maze import MazeEnv
+from lerobot_pf2mp.envs.point_maze import BALL_RADIUS, MAZE_MAPS, make_point_maze, parse_maze_map
+from lerobot_pf2mp.envs.swept_ball import SweptBall
 from lerobot_pf2mp.errors import ConfigError
 
 CONTROLS = ("exact", "pd")

@@ -5,14 +5,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from lerobot_pf2mp import potential_field
-from lerobot_pf2mp.potential_field import (
-    BANDWIDTH_RULES,
-    PotentialField,
-    fit,
-    leave_one_out_log_likelihood,
-    select_bandwidth,
-)
+from lerobot_pf2mp import kernel_density, potential_field
+from lerobot_pf2mp.kernel_density import BANDWIDTH_RULES, leave_one_out_log_likelihood, select_bandwidth
+from lerobot_pf2mp.potential_field import PotentialField, fit
 
 # What follows is the specification in its most obvious form: all pairs at once, float64, autograd.
 
@@ -299,7 +294,8 @@ def test_the_leave_one_out_likelihood_equals_a_float64_brute_force():
 def test_the_leave_one_out_likelihood_does_not_depend_on_the_blocks(monkeypatch):
     points = clusters(150, 3)
     expected = leave_one_out_log_likelihood(points, 0.3)
-    monkeypatch.setattr(potential_field, "_PAIRS_PER_BLOCK", 1000)
+    monkeypatch.setattr(potential_field, "PAIRS_PER_BLOCK", 1000)
+    monkeypatch.setattr(kernel_density, "PAIRS_PER_BLOCK", 1000)
     assert leave_one_out_log_likelihood(points, 0.3) == pytest.approx(expected, rel=1e-9)
 
 
@@ -323,7 +319,7 @@ def test_the_likelihood_rule_recovers_the_scale_of_clusters_that_scott_smooths_o
 
 def test_the_likelihood_rule_on_a_subset_is_carried_over_to_all_points():
     points = torch.randn(2000, 2)
-    of_a_subset = potential_field._most_likely_bandwidth(points, 0.01, 3.0, n_points=300)
+    of_a_subset = kernel_density._most_likely_bandwidth(points, 0.01, 3.0, n_points=300)
     assert of_a_subset == pytest.approx(select_bandwidth(points, "likelihood"), rel=0.2)
 
 
@@ -458,6 +454,7 @@ def test_twenty_thousand_anchors_serve_thousands_of_queries():
 def test_the_blocks_do_not_change_the_result(monkeypatch):
     points, a = clusters(300, 3), torch.randn(100, 3)
     expected = fit(points, bandwidth=0.3, threshold_quantile=0.3, alpha=-1.0).potential_gradient(a)
-    monkeypatch.setattr(potential_field, "_PAIRS_PER_BLOCK", 1000)
+    monkeypatch.setattr(potential_field, "PAIRS_PER_BLOCK", 1000)
+    monkeypatch.setattr(kernel_density, "PAIRS_PER_BLOCK", 1000)
     result = fit(points, bandwidth=0.3, threshold_quantile=0.3, alpha=-1.0).potential_gradient(a)
     torch.testing.assert_close(result, expected, rtol=1e-5, atol=1e-5)
