@@ -404,7 +404,7 @@ def test_an_interruption_keeps_the_dataset_that_was_to_be_replaced(
     assert contents_of(tmp_path) == before
 
 
-@pytest.mark.parametrize("n_before", [0, 2])
+@pytest.mark.parametrize("n_before", [0, 2, 5])  # 5 episodes, then their metadata
 def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, monkeypatch, n_before: int) -> None:
     write_table, n_calls = pq.ParquetWriter.write_table, itertools.count()
 
@@ -414,6 +414,20 @@ def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, monkeypatch, n_before
         write_table(self, *args, **kwargs)
 
     monkeypatch.setattr(pq.ParquetWriter, "write_table", write_until_full)
+    with pytest.raises(OSError, match="No space left on device"):
+        write_dataset(tmp_path / "d", SPEC, toy_episodes(5))
+    assert everything_in(tmp_path) == []
+
+
+def test_a_disk_too_full_for_metadata_leaves_nothing_behind(tmp_path: Path, monkeypatch) -> None:
+    begin = pq.ParquetWriter.__init__
+
+    def begin_unless_full(self: pq.ParquetWriter, where: object, *args: object, **kwargs: object) -> None:
+        if "episodes" in str(where):
+            raise OSError(28, "No space left on device")
+        begin(self, where, *args, **kwargs)
+
+    monkeypatch.setattr(pq.ParquetWriter, "__init__", begin_unless_full)
     with pytest.raises(OSError, match="No space left on device"):
         write_dataset(tmp_path / "d", SPEC, toy_episodes(5))
     assert everything_in(tmp_path) == []

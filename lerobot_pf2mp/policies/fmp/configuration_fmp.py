@@ -142,6 +142,12 @@ class FMPConfig(PreTrainedConfig):
                 f"horizon must be a multiple of {factor}, the downsampling of a U-Net with {len(self.down_dims)} levels, "
                 f"got horizon={self.horizon} and down_dims={self.down_dims}"
             )
+        if self.kernel_size < 1 or self.kernel_size % 2 == 0:
+            raise ValueError(f"kernel_size must be odd, so that lengths are kept, got {self.kernel_size}")
+        if self.diffusion_step_embed_dim < 4 or self.diffusion_step_embed_dim % 2:
+            raise ValueError(
+                f"diffusion_step_embed_dim must be even and at least 4, got {self.diffusion_step_embed_dim}"
+            )
         if self.integrator not in INTEGRATORS:
             raise ValueError(f"integrator must be one of {INTEGRATORS}, got {self.integrator!r}")
         if self.time_sampling not in TIME_SAMPLINGS:
