@@ -116,28 +116,23 @@ def write_dataset(
             use_videos=False,
             metadata_buffer_size=100,
         )
-        meta.save_episode_tasks([spec.task])
-        all_stats = []
         try:
+            meta.save_episode_tasks([spec.task])
             with _FrameFiles(meta) as files:
-                for episode in episodes:
-                    _check(episode, spec.features, meta.total_episodes)
-                    all_stats.append(_write_episode(meta, files, episode, spec.task))
+                all_stats = [_write_episode(meta, files, episode, spec) for episode in episodes]
+            if not all_stats:
+                raise ValueError("a dataset must hold at least one episode, got none that is usable")
+            meta.finalize()
+            meta.info.total_tasks = len(meta.tasks)
+            meta.info.splits = {"train": f"0:{len(all_stats)}"}
+            write_info(meta.info, partial)
+            write_stats(aggregate_stats(all_stats), partial)
+            (partial / "README.md").write_text(spec.card, encoding="utf-8")
         except BaseException:
             # Otherwise the metadata would write its last episodes when it is garbage-collected, folder or not.
             meta._metadata_buffer.clear()
-            meta.finalize()
             raise
-        n_episodes = meta.total_episodes
-        if n_episodes == 0:
-            raise ValueError("a dataset must hold at least one episode, got none that is usable")
-        meta.finalize()
-        meta.info.total_tasks = len(meta.tasks)
-        meta.info.splits = {"train": f"0:{n_episodes}"}
-        write_info(meta.info, partial)
-        write_stats(aggregate_stats(all_stats), partial)
-        (partial / "README.md").write_text(spec.card, encoding="utf-8")
-    return n_episodes
+    return len(all_stats)
 
 
 class _FrameFiles:
@@ -191,12 +186,13 @@ def _arrow(column: np.ndarray) -> pa.Array:
 
 
 def _write_episode(
-    meta: LeRobotDatasetMetadata, files: _FrameFiles, episode: dict[str, np.ndarray], task: str
+    meta: LeRobotDatasetMetadata, files: _FrameFiles, episode: dict[str, np.ndarray], spec: DatasetSpec
 ) -> dict[str, dict[str, np.ndarray]]:
     """Writes one episode and returns its statistics.
 
     As LeRobot's ``save_episode`` does, but for info.json and stats.json, which it rewrites after every episode.
     """
+    _check(episode, spec.features, meta.total_episodes)
     n_frames = len(next(iter(episode.values())))
     first, index = meta.total_frames, meta.total_episodes
     frames = {
@@ -205,14 +201,14 @@ def _write_episode(
         "frame_index": np.arange(n_frames),
         "episode_index": np.full(n_frames, index),
         "index": np.arange(first, first + n_frames),
-        "task_index": np.full(n_frames, meta.get_task_index(task)),
+        "task_index": np.full(n_frames, meta.get_task_index(spec.task)),
     }
     chunk_index, file_index = files.append(frames)
     stats = compute_episode_stats({key: frames[key] for key in meta.features}, meta.features)
     meta._save_episode_metadata(
         {
             "episode_index": index,
-            "tasks": [task],
+            "tasks": [spec.task],
             "length": n_frames,
             "data/chunk_index": chunk_index,
             "data/file_index": file_index,

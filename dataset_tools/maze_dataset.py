@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable
+from contextlib import closing
 from itertools import islice
 from pathlib import Path
 
@@ -102,19 +103,15 @@ def write_maze_dataset(
     ball = SweptBall(spec, BALL_RADIUS)
     dropped: Counter[str] = Counter()
     card = _CARD.format(title=repo_id, origin=origin, n_steps=n_steps, fps=FPS)
-    n_written = write_dataset(
-        root,
-        DatasetSpec(repo_id, FPS, _FEATURES, TASK_DESCRIPTION, card),
-        _with_progress(
-            islice(prepare(trajectories, n_steps, ball.collides, dropped), n_episodes),
-            n_episodes or n_expected,
-        ),
-        overwrite=overwrite,
-    )
+    spec_of_dataset = DatasetSpec(repo_id, FPS, _FEATURES, TASK_DESCRIPTION, card)
+    usable = islice(prepare(trajectories, n_steps, ball.collides, dropped), n_episodes)
+    # Closed here rather than by the garbage collector, so that an interrupted bar is not drawn again at the end.
+    with closing(_with_progress(usable, n_episodes or n_expected)) as episodes:
+        n_written = write_dataset(root, spec_of_dataset, episodes, overwrite=overwrite)
     return n_written, dropped
 
 
 def _with_progress(
     episodes: Iterable[dict[str, np.ndarray]], total: int | None
-) -> Iterator[dict[str, np.ndarray]]:
+) -> Generator[dict[str, np.ndarray]]:
     yield from tqdm(episodes, total=total, desc="Writing", unit="episode", mininterval=1.0)

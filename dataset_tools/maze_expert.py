@@ -33,12 +33,14 @@ class MazeExpert:
         seed: Seed of everything random.
 
     Raises:
-        ValueError: If the noise is negative or not finite, or the map is not a maze.
+        ValueError: If the noise or the seed is negative, or the map is not a maze.
     """
 
     def __init__(self, maze_map: str, action_noise: float, seed: int) -> None:
         if not (np.isfinite(action_noise) and action_noise >= 0):
             raise ValueError(f"action_noise must be finite and at least 0, got {action_noise}")
+        if seed < 0:
+            raise ValueError(f"seed must be at least 0, got {seed}")
         self._env, _ = make_point_maze(maze_map)
         self._maze = self._env.maze
         self._noise = action_noise

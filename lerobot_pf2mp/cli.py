@@ -217,7 +217,7 @@ def _demo(config: DemoConfig) -> None:
     from lerobot_pf2mp.demo import run_demo
 
     run_demo(
-        config.output_dir,
+        config.output_dir.expanduser(),
         task=config.task,
         n_demonstrations=config.n_demonstrations,
         steps=config.steps,
@@ -232,14 +232,14 @@ def _benchmark(config: BenchmarkConfig) -> None:
     if config.checkpoint is None:
         raise ValueError("--checkpoint must name a pretrained_model folder, got none")
     results = run_benchmark(
-        config.checkpoint,
+        config.checkpoint.expanduser(),
         config.env,
         [Guidance.parse(text) for text in config.guidance],
         n_episodes=config.n_episodes,
         n_repeats=config.n_repeats,
         seed=config.seed,
     )
-    write_results(config.output, results)
+    write_results(config.output.expanduser(), results)
     print(f"{make_table(results)}\nWrote {config.output}.")
 
 
@@ -247,7 +247,7 @@ def _dataset_place(config: CollectConfig | ConvertConfig) -> tuple[str, Path]:
     from lerobot.utils.constants import HF_LEROBOT_HOME
 
     repo_id = config.repo_id or f"local/{'maze' if config.maze_map else config.task}"
-    return repo_id, config.root or HF_LEROBOT_HOME / repo_id
+    return repo_id, (config.root or HF_LEROBOT_HOME / repo_id).expanduser()
 
 
 def _report(n_episodes: int, n_steps: int, dropped: Counter[str], root: Path) -> None:
@@ -271,5 +271,5 @@ def _run(config_class: type, main: Callable[[Any], None]) -> None:
         RuntimeError,
         OSError,
     ) as error:
-        print(f"error: {error}", file=sys.stderr)
+        print("error:", " ".join(str(error).split()), file=sys.stderr)
         sys.exit(1)

@@ -11,11 +11,9 @@ import numpy as np
 
 from lerobot_pf2mp.envs.point_maze import BALL_RADIUS
 
-# What a clearance is looked for within [m]; nothing in a maze of unit cells is farther from a wall.
-_CLEARANCE_RANGE = 2.0
 _TALL_WALL = 10.0  # half height [m]
 # MuJoCo's distance between a capsule and a box looks at the capsule's ends: where the whole of a long one crosses the box
-# in the middle, it finds none. Short pieces are measured to within 1e-6 m.
+# in the middle, it finds none. Short pieces are measured to within about 1e-5 m.
 _LONGEST_PIECE = 0.25  # [m]
 # MuJoCo's distance to a box is wrong for capsules of no length at all.
 _SHORTEST_HALF_LENGTH = 1e-5
@@ -50,6 +48,11 @@ class SweptBall:
         )
         self._centres = self._model.geom_pos[self._walls, :2].copy()
         self._half_sizes = self._model.geom_size[self._walls, :2].copy()
+        self._border = (
+            (self._centres - self._half_sizes).min(axis=0),
+            (self._centres + self._half_sizes).max(axis=0),
+        )
+        self._diagonal = float(np.linalg.norm(self._border[1] - self._border[0]))  # no wall is farther [m]
         self._height = float(
             self._model.geom_pos[self._walls[0], 2]
         )  # the walls are prisms: any height will do
@@ -60,8 +63,9 @@ class SweptBall:
 
         Args:
             start: ``(2,)`` position of its centre before [m].
-            end: ``(2,)`` position after [m].
+            end: ``(2,)`` position after [m]; positions beyond the map count as on its border.
         """
+        start, end = np.clip(start, *self._border), np.clip(end, *self._border)
         n_pieces = max(1, math.ceil(math.dist(start, end) / _LONGEST_PIECE))
         return min(
             self._clearance_of_piece(*piece) for piece in pairwise(np.linspace(start, end, n_pieces + 1))
@@ -73,18 +77,20 @@ class SweptBall:
         gaps = np.maximum(self._centres - self._half_sizes - high, low - self._centres - self._half_sizes)
         bounds = np.linalg.norm(gaps.clip(min=0), axis=1) - self._radius
         self._place(start, end)
-        smallest = _CLEARANCE_RANGE
+        smallest = self._diagonal
         for wall in np.argsort(bounds):
             if bounds[wall] >= smallest:
                 break
             distance = mujoco.mj_geomDistance(
-                self._model, self._data, self._geom, self._walls[wall], _CLEARANCE_RANGE, None
+                self._model, self._data, self._geom, self._walls[wall], self._diagonal, None
             )
             smallest = min(smallest, distance)
         return smallest
 
     def collides(self, path: np.ndarray) -> bool:
         """Whether the ball touches a wall along a polyline ``(N, 2)`` of positions [m], N >= 2."""
+        if not ((path >= self._border[0]) & (path <= self._border[1])).all():
+            return True  # the border is wall
         low, high = np.minimum(path[:-1], path[1:]), np.maximum(path[:-1], path[1:])  # (N - 1, 2)
         gaps = np.maximum(
             (self._centres - self._half_sizes)[:, None] - high,
