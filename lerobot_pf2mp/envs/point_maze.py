@@ -3,13 +3,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
 import numpy as np
-from gymnasium_robotics.envs.maze.maps import LARGE_MAZE, MEDIUM_MAZE, U_MAZE
-from gymnasium_robotics.envs.maze.point_maze import PointMazeEnv
+
+with contextlib.redirect_stderr(io.StringIO()):  # at every import a notice about quite other environments
+    from gymnasium_robotics.envs.maze.maps import LARGE_MAZE, MEDIUM_MAZE, U_MAZE
+    from gymnasium_robotics.envs.maze.point_maze import PointMazeEnv
 
 BALL_RADIUS = 0.1  # [m], of PointMaze's particle_geom
 MAZE_MAPS = {"umaze": U_MAZE, "medium": MEDIUM_MAZE, "large": LARGE_MAZE}
