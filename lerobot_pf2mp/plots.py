@@ -154,7 +154,7 @@ def _draw_density(
 def _draw_arrows(
     axis: Axes, field: PotentialField, to_metres: Callable[[Tensor], Tensor], maze_map: list[list[int]]
 ) -> None:
-    x, y, actions, scale = _grid_of_maze(to_metres, maze_map, per_cell=4)
+    x, y, actions, scale = _grid_of_maze(to_metres, maze_map, per_cell=3)
     log_density = field.log_density(actions).numpy()
     # Phi is a gradient in normalised units; as a step it points in the direction of Phi times metres for each unit.
     steps = field.potential_gradient(actions).numpy() * scale
@@ -168,8 +168,11 @@ def _draw_arrows(
         color=ARROW,
         angles="xy",
         scale_units="xy",
-        scale=5.5,
-        width=0.003,
+        scale=3.6,
+        width=0.0032,
+        headwidth=3,
+        headlength=3.5,
+        headaxislength=3,
         pivot="middle",
         zorder=4,
     )
