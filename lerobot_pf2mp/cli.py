@@ -14,8 +14,7 @@ from typing import Any
 import draccus
 
 from lerobot_pf2mp.envs.configs import PF2MPMazeEnv
-
-INTERRUPTED = 130  # the shell's exit code for Ctrl-C
+from lerobot_pf2mp.errors import INTERRUPTED
 
 
 @dataclass

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one error type of this package; everything else raises Python's own."""
+"""The one error type of this package, everything else raises Python's own; and the exit code of an interruption."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from draccus.utils import ParsingError
+
+INTERRUPTED = 130  # the shell's exit code for Ctrl-C
 
 
 class ConfigError(ParsingError):

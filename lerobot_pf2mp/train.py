@@ -16,6 +16,7 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.factory import make_train_eval_datasets
 from lerobot.scripts import lerobot_train
 
+from lerobot_pf2mp.errors import INTERRUPTED
 from lerobot_pf2mp.in_memory_dataset import InMemoryDataset, fits_in_memory
 
 MEMORY_LIMIT_OPTION = "--in_memory_limit_gb"
@@ -56,7 +57,11 @@ def main() -> None:
 
     # The one place where the training function gets its data; there is no plug-in point for it in LeRobot 0.6.
     lerobot_train.make_train_eval_datasets = make_datasets
-    lerobot_train.main()
+    try:
+        lerobot_train.main()
+    except KeyboardInterrupt:
+        print("\ninterrupted: training goes on from the last checkpoint with --resume=true", file=sys.stderr)
+        sys.exit(INTERRUPTED)
 
 
 def _in_memory(config: TrainPipelineConfig, dataset: Any, limit_bytes: float) -> Any:
