@@ -2,8 +2,8 @@
 """Rectified flow between noise x_0 at t = 0 and data x_1 at t = 1 (Section IV-A of the paper; Liu et al., 2022).
 
 path       x_t = (1 - t) x_0 + t x_1
-velocity   u_t = x_1 - x_0                                             Eq. 6
-loss       E |v_theta(x_t, t; o) - u_t|^2                              Eq. 7, Algorithm 1
+velocity   u_t = x_1 - x_0                                             Eq. 7
+loss       E |v_theta(x_t, t; o) - u_t|^2                              Eq. 8, Algorithm 1
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Guide(Protocol):
 
 
 def sample_path(x_0: Tensor, x_1: Tensor, t: Tensor) -> PathSample:
-    """The point x_t = (1 - t) x_0 + t x_1 and the velocity x_1 - x_0 (Eq. 6).
+    """The point x_t = (1 - t) x_0 + t x_1 and the velocity x_1 - x_0 (Eq. 7).
 
     Args:
         x_0: ``(B, ...)`` noise.
@@ -69,7 +69,7 @@ def flow_matching_loss(
     t: Tensor,
     is_pad: Tensor | None = None,
 ) -> Tensor:
-    """The loss |v_theta(x_t, t) - u_t|^2 of Eq. 7, averaged over action dimensions only.
+    """The loss |v_theta(x_t, t) - u_t|^2 of Eq. 8, averaged over action dimensions only.
 
     Args:
         velocity: Maps ``(B, T, A)`` points and ``(B,)`` times to ``(B, T, A)`` velocities.
@@ -127,7 +127,7 @@ def integrate(
     integrator: str = "euler",
     guide: Guide | None = None,
 ) -> Tensor:
-    """The solution x_1 of dx/dt = v(x, t) from x_0 at t = 0, in `num_steps` steps of dt = 1/num_steps (Eq. 8).
+    """The solution x_1 of dx/dt = v(x, t) from x_0 at t = 0, in `num_steps` steps of dt = 1/num_steps (Eq. 9).
 
     Args:
         velocity: Maps ``(B, ...)`` points and ``(B,)`` times to ``(B, ...)`` velocities. Called once for each step by

@@ -4,10 +4,10 @@
 Everything lives in the space in which the policy generates (normalised actions). With M anchors x_i, demonstrated
 actions drawn at random, and a bandwidth h:
 
-    density       p(a)   = 1/M sum_i N(a; x_i, h^2 I)                      Gaussian KDE, Section III-B
-    potential     phi(a) = log p(a) + alpha d(a, H),  alpha <= 0           Section IV-B; larger is safer
+    density       p(a)   = 1/M sum_i N(a; x_i, h^2 I)                      Gaussian KDE, Eq. 6
+    potential     phi(a) = log p(a) + alpha d(a, H),  alpha <= 0           Eq. 10; larger is safer
     safe set      H      = {a : log p(a) > log_threshold}
-    gradient      Phi(a) = grad phi(a)                                     Eq. 9, points to safety
+    gradient      Phi(a) = grad phi(a)                                     Eq. 11, points to safety
 
 The score grad log p is closed form, (m(a) - a) / h^2 with the local mean m(a) = softmax_i(-|a - x_i|^2 / 2h^2) x_i
 (one attention call), because LeRobot evaluates under ``torch.inference_mode()``, where autograd cannot run.
@@ -134,7 +134,7 @@ class PotentialField:
         """The vector from a to the safe set H; zero inside H.
 
         The paper does not say how d(a, H) is measured. Outside H this is the vector to the nearest anchor that lies
-        in H, an upper bound of the distance to H itself, exact to within about a bandwidth and never leading past H.
+        in H: it ends in H, never past it, and its length is an upper bound of the distance to H.
 
         Args:
             a: ``(..., D)`` actions [normalised].
@@ -171,7 +171,7 @@ class PotentialField:
         return phi
 
     def potential_gradient(self, a: Tensor) -> Tensor:
-        """The potential field Phi(a) = grad phi(a) of Eq. 9, one row for each action.
+        """The potential field Phi(a) = grad phi(a) of Eq. 11, one row for each action.
 
         Args:
             a: ``(..., D)`` actions [normalised].
