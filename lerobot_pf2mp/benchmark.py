@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from lerobot_pf2mp.guidance import GUIDANCE_INTEGRATORS
 from lerobot_pf2mp.loading import load_policy
-from lerobot_pf2mp.statistics import Rate
+from lerobot_pf2mp.rate import Rate
 
 
 @dataclass(frozen=True)

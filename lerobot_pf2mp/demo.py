@@ -25,7 +25,7 @@ from lerobot_pf2mp.envs.swept_ball import SweptBall
 from lerobot_pf2mp.loading import load_policy
 from lerobot_pf2mp.plots import MazePath, plot_maze_overview
 from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
-from lerobot_pf2mp.statistics import Rate
+from lerobot_pf2mp.rate import Rate
 
 _MODULES = {
     "pf2mp-train": "lerobot_pf2mp.train",
@@ -102,7 +102,9 @@ def run_demo(
     _say(5, "Figure and table")
     figure = output_dir / "overview.png"
     if not figure.exists():
-        _plot(checkpoint, maze, figure, seed)
+        partial = figure.with_name("partial.png")
+        _plot(checkpoint, maze, partial, seed)
+        partial.rename(figure)
     table = _table(results)
     (output_dir / "results.md").write_text(table, encoding="utf-8")
     write_results(output_dir / "results.csv", results)
@@ -168,11 +170,11 @@ def _evaluate(
     task: str, checkpoint: Path, output_dir: Path, n_episodes: int, seed: int, guidance_scale: float
 ) -> Result:
     env_task = {maze: name for name, maze in MAZE_TASKS.items()}[maze_of(task, None)]
-    result = output_dir / "eval_info.json"
-    if result.exists():
+    if output_dir.exists():
         print("done already")
     else:
-        shutil.rmtree(output_dir, ignore_errors=True)
+        partial = output_dir.with_name(f"{output_dir.name}.partial")
+        shutil.rmtree(partial, ignore_errors=True)
         _run(
             "lerobot-eval",
             f"--policy.path={checkpoint}",
@@ -183,10 +185,11 @@ def _evaluate(
             f"--eval.batch_size={min(n_episodes, 50)}",
             "--eval.use_async_envs=false",
             f"--seed={seed}",
-            f"--output_dir={output_dir}",
+            f"--output_dir={partial}",
             log=output_dir.with_suffix(".log"),
         )
-    metrics = json.loads(result.read_text())["per_task"][0]["metrics"]
+        partial.rename(output_dir)
+    metrics = json.loads((output_dir / "eval_info.json").read_text())["per_task"][0]["metrics"]
     return Result(
         task=env_task,
         policy="fmp" if guidance_scale == 0 else "pf2mp",

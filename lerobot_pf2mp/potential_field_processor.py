@@ -87,7 +87,10 @@ class DemonstratedActions:
 
     def __init__(self, settings: FieldSettings) -> None:
         self.settings = settings
-        self._dataset_id = b""
+        self._start_afresh(dataset_id=b"")
+
+    def _start_afresh(self, dataset_id: bytes) -> None:
+        self._dataset_id = dataset_id
         self._n_shown = 0
         self._ranks = torch.empty(0, dtype=torch.int64)  # (P,) ascending
         self._points = torch.empty(0, 0)  # (P, D), in the order of the ranks
@@ -121,8 +124,7 @@ class DemonstratedActions:
         if (dataset_id, settings.action_dims) != (self._dataset_id, self.settings.action_dims):
             if len(self):
                 logger.info("The demonstrations have changed: the potential field is fitted to the new ones.")
-            self.__init__(settings)  # type: ignore[misc]
-            self._dataset_id = dataset_id
+            self._start_afresh(dataset_id)
         self.settings = settings
         actions = _select_dims(actions.detach().float(), settings.action_dims)
         steps = torch.arange(actions.shape[1], device=actions.device)
