@@ -76,6 +76,24 @@ def test_all_kinds_of_guidance_see_the_same_episodes_and_every_repeat_other_nois
     assert run_benchmark(checkpoint, env, guidances, **options) == results
 
 
+def test_every_kind_of_guidance_is_the_one_that_acts(
+    checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    acted = []
+    make_guide = PF2MPPolicy._make_guide
+
+    def recorded(self: PF2MPPolicy, batch: dict) -> object:
+        guide = make_guide(self, batch)
+        acted.append((type(guide).__name__, getattr(guide, "scale", 0.0)))
+        return guide
+
+    monkeypatch.setattr(PF2MPPolicy, "_make_guide", recorded)
+    guidances = [Guidance.parse(text) for text in ("fmp", "euler:0.01", "proximal:0.8")]
+    env = PF2MPMazeEnv(task="MazeUMaze-v0", episode_length=2)
+    run_benchmark(checkpoint, env, guidances, n_episodes=2, n_repeats=1, seed=0)
+    assert acted == [("NoneType", 0.0), ("EulerGuide", 0.01), ("ProximalGuide", 0.8)]
+
+
 def test_collisions_and_successes_are_counted(checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # A policy that goes straight to the goal: in a free room it arrives, through the middle wall of a U it collides.
     def to_the_goal(self: PF2MPPolicy, batch: dict, **_: object) -> torch.Tensor:
