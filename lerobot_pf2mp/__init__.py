@@ -6,10 +6,18 @@ Importing this package registers the policies, their processor step and the envi
 
 from lerobot_pf2mp.envs import PF2MPMazeEnv
 from lerobot_pf2mp.loading import load_policy
+from lerobot_pf2mp.policies.dppf.configuration_dppf import DPPFConfig
 from lerobot_pf2mp.policies.fmp.configuration_fmp import FMPConfig
 from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
 from lerobot_pf2mp.potential_field_processor import PotentialFieldProcessorStep
 
 __version__ = "0.1.0"
 
-__all__ = ["FMPConfig", "PF2MPConfig", "PF2MPMazeEnv", "PotentialFieldProcessorStep", "load_policy"]
+__all__ = [
+    "DPPFConfig",
+    "FMPConfig",
+    "PF2MPConfig",
+    "PF2MPMazeEnv",
+    "PotentialFieldProcessorStep",
+    "load_policy",
+]

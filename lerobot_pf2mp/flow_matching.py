@@ -35,8 +35,15 @@ class PathSample:
 class Guide(Protocol):
     """Bends one integration step."""
 
-    def __call__(self, x_t: Tensor, x_next: Tensor, dt: float) -> Tensor:
-        """The guided x_{t+dt}, from x_t and the unguided x_{t+dt}, all ``(B, ...)``."""
+    def __call__(self, x_t: Tensor, x_next: Tensor, x_1: Tensor, dt: float) -> Tensor:
+        """The guided x_{t+dt}, ``(B, ...)``.
+
+        Args:
+            x_t: ``(B, ...)`` where the step begins.
+            x_next: ``(B, ...)`` the unguided x_{t+dt}.
+            x_1: ``(B, ...)`` the end point that the step predicts.
+            dt: Length of the step; the steps of one generation add up to 1.
+        """
 
 
 def sample_path(x_0: Tensor, x_1: Tensor, t: Tensor) -> PathSample:
@@ -155,5 +162,7 @@ def integrate(
         if integrator == "midpoint":
             slope = velocity(x + 0.5 * dt * slope, t + 0.5 * dt)
         x_next = x + dt * slope
-        x = x_next if guide is None else guide(x, x_next, dt)
+        if guide is not None:
+            x_next = guide(x, x_next, x + (1 - step * dt) * slope, dt)
+        x = x_next
     return x

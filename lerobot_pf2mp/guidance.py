@@ -5,6 +5,9 @@ Both guides share lambda (`guidance_scale`) and the limit of small lambda. Over 
 lambda Phi moves an action the fraction lambda dt / h^2 of the way to its local mean. `euler` takes that step as
 printed; beyond a fraction of 1 it overshoots, the sensitivity to lambda that the paper reports. `proximal` solves the
 same equation exactly over the step and cannot overshoot for any lambda.
+
+They also differ in where they ask the field (`guidance_point`): `euler` at x_t, as printed; `proximal` after the
+generative step, when the noise which that step removes is gone. At x_t the guidance would remove it a second time.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from lerobot_pf2mp.potential_field import PotentialField
 _TINY = torch.finfo(torch.float32).tiny
 
 GUIDANCE_INTEGRATORS = ("euler", "proximal")
+GUIDANCE_POINTS = ("current", "end", "next")
 
 
 @dataclass(frozen=True)
@@ -31,14 +35,17 @@ class EulerGuide:
     Args:
         field: The potential field.
         scale: lambda >= 0.
+        point: Where Phi is evaluated, one of `GUIDANCE_POINTS`.
     """
 
     field: PotentialField
     scale: float
+    point: str = "current"
 
-    def __call__(self, x_t: Tensor, x_next: Tensor, dt: float) -> Tensor:
+    def __call__(self, x_t: Tensor, x_next: Tensor, x_1: Tensor, dt: float) -> Tensor:
         """The guided step from the unguided one, all ``(..., D)`` [normalised]."""
-        return x_next + self.scale * dt * self.field.potential_gradient(x_t)
+        a = _choose(self.point, x_t, x_next, x_1)
+        return x_next + self.scale * dt * self.field.potential_gradient(a)
 
 
 @dataclass(frozen=True)
@@ -47,23 +54,26 @@ class ProximalGuide:
 
     With the local mean m held fixed, dx/dt = lambda (m - x) / h^2 has the solution
     x = m + (x - m) exp(-lambda dt / h^2). The distance term pulls with constant strength lambda |alpha| and stops
-    where it arrives. Where the paper evaluates Phi at x_t, this evaluates it after the flow's step, when the noise
-    that the flow removes is gone; at x_t the guidance would remove it a second time.
+    where it arrives.
 
     Args:
         field: The potential field.
         scale: lambda >= 0.
+        point: Where the local mean is taken, one of `GUIDANCE_POINTS`.
     """
 
     field: PotentialField
     scale: float
+    point: str = "next"
 
-    def __call__(self, x_t: Tensor, x_next: Tensor, dt: float) -> Tensor:
+    def __call__(self, x_t: Tensor, x_next: Tensor, x_1: Tensor, dt: float) -> Tensor:
         """The guided step from the unguided one, all ``(..., D)`` [normalised]."""
         decay = math.exp(-self.scale * dt / self.field.bandwidth**2)
-        guided = x_next + (1 - decay) * self.field.mean_shift(x_next)
+        a = _choose(self.point, x_t, x_next, x_1)
+        shift = (1 - decay) * self.field.mean_shift(a)
+        guided = x_next + shift
         if self.field.alpha != 0:
-            offset = self.field.offset_to_safe_set(guided)
+            offset = self.field.offset_to_safe_set(a + shift)
             distance = offset.norm(dim=-1, keepdim=True)
             reach = self.scale * -self.field.alpha * dt
             guided = guided + offset * (reach / distance.clamp_min(max(reach, _TINY)))
@@ -75,6 +85,7 @@ def make_guide(
     scale: float,
     integrator: str = "proximal",
     action_dims: Sequence[int] | None = None,
+    point: str | None = None,
 ) -> Guide | None:
     """The guide for one integrator, or None for `scale` = 0, which is exactly the unguided process.
 
@@ -83,6 +94,8 @@ def make_guide(
         scale: lambda, finite and at least 0.
         integrator: One of `GUIDANCE_INTEGRATORS`.
         action_dims: Which of the last dimension's entries the field covers; the others pass unchanged. None: all.
+        point: Where the field is evaluated, one of `GUIDANCE_POINTS`: at x_t, at the end point that the step predicts,
+            or after the step. None: the integrator's own, current for euler and next for proximal.
 
     Returns:
         The guide, or None.
@@ -94,9 +107,12 @@ def make_guide(
         raise ValueError(f"guidance_scale must be finite and at least 0, got {scale}")
     if integrator not in GUIDANCE_INTEGRATORS:
         raise ValueError(f"guidance_integrator must be one of {GUIDANCE_INTEGRATORS}, got {integrator!r}")
+    if point is not None and point not in GUIDANCE_POINTS:
+        raise ValueError(f"guidance_point must be one of {GUIDANCE_POINTS} or None, got {point!r}")
     if scale == 0:
         return None
-    guide = EulerGuide(field, scale) if integrator == "euler" else ProximalGuide(field, scale)
+    make = EulerGuide if integrator == "euler" else ProximalGuide
+    guide = make(field, scale) if point is None else make(field, scale, point)
     return guide if action_dims is None else _OnDimensions(guide, tuple(action_dims))
 
 
@@ -107,7 +123,12 @@ class _OnDimensions:
     guide: Guide
     dims: tuple[int, ...]
 
-    def __call__(self, x_t: Tensor, x_next: Tensor, dt: float) -> Tensor:
+    def __call__(self, x_t: Tensor, x_next: Tensor, x_1: Tensor, dt: float) -> Tensor:
         dims = torch.tensor(self.dims, device=x_next.device)
-        guided = self.guide(x_t.index_select(-1, dims), x_next.index_select(-1, dims), dt)
+        a_t, a_next, a_1 = (x.index_select(-1, dims) for x in (x_t, x_next, x_1))
+        guided = self.guide(a_t, a_next, a_1, dt)
         return x_next.index_copy(-1, dims, guided.to(x_next.dtype))
+
+
+def _choose(point: str, x_t: Tensor, x_next: Tensor, x_1: Tensor) -> Tensor:
+    return {"current": x_t, "end": x_1, "next": x_next}[point]

@@ -80,14 +80,14 @@ def test_every_kind_of_guidance_is_the_one_that_acts(
     checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     acted = []
-    make_guide = PF2MPPolicy._make_guide
+    make_guide = PF2MPPolicy.make_guide
 
     def recorded(self: PF2MPPolicy, batch: dict) -> object:
         guide = make_guide(self, batch)
         acted.append((type(guide).__name__, getattr(guide, "scale", 0.0)))
         return guide
 
-    monkeypatch.setattr(PF2MPPolicy, "_make_guide", recorded)
+    monkeypatch.setattr(PF2MPPolicy, "make_guide", recorded)
     guidances = [Guidance.parse(text) for text in ("fmp", "euler:0.01", "proximal:0.8")]
     env = PF2MPMazeEnv(task="MazeUMaze-v0", episode_length=2)
     run_benchmark(checkpoint, env, guidances, n_episodes=2, n_repeats=1, seed=0)

@@ -172,16 +172,17 @@ def test_each_step_calls_the_network_once_or_twice_at_the_right_times(integrator
 def test_the_guide_sees_every_step_once_and_its_answer_is_where_the_next_step_starts(integrator):
     x_0, c, seen = torch.randn(3, 8, 2), torch.tensor([1.0, -1.0]), []
 
-    def guide(x_t, x_next, dt):
-        seen.append((x_t, x_next, dt))
+    def guide(x_t, x_next, x_1, dt):
+        seen.append((x_t, x_next, x_1, dt))
         return x_next + 10
 
     x_1 = integrate(lambda x, t: c.expand_as(x), x_0, 4, integrator=integrator, guide=guide)
-    assert [dt for _, _, dt in seen] == [0.25] * 4
+    assert [dt for *_, dt in seen] == [0.25] * 4
     expected = x_0
-    for x_t, x_next, _ in seen:
+    for step, (x_t, x_next, predicted_end, _) in enumerate(seen):
         torch.testing.assert_close(x_t, expected)
         torch.testing.assert_close(x_next, x_t + 0.25 * c)
+        torch.testing.assert_close(predicted_end, x_t + (1 - 0.25 * step) * c)
         expected = x_next + 10
     assert torch.equal(x_1, expected)
 
@@ -189,7 +190,7 @@ def test_the_guide_sees_every_step_once_and_its_answer_is_where_the_next_step_st
 def test_the_starting_points_are_not_modified():
     x_0 = torch.randn(3, 8, 2)
     before = x_0.clone()
-    integrate(lambda x, t: x, x_0, 3, guide=lambda x_t, x_next, dt: x_next.add_(1))
+    integrate(lambda x, t: x, x_0, 3, guide=lambda x_t, x_next, x_1, dt: x_next.add_(1))
     assert torch.equal(x_0, before)
 
 

@@ -18,7 +18,7 @@ def test_the_euler_guide_is_algorithm_2_as_printed(alpha):
     field, scale, dt = random_field(3, alpha), 0.05, 0.2
     x_t, v = 2 * torch.randn(4, 8, 3), torch.randn(4, 8, 3)
     phi = field.potential_gradient(x_t)
-    guided = make_guide(field, scale, "euler")(x_t, x_t + v * dt, dt)
+    guided = make_guide(field, scale, "euler")(x_t, x_t + v * dt, x_t + v, dt)
     torch.testing.assert_close(guided, x_t + (v + scale * phi) * dt, rtol=1e-5, atol=1e-5)
 
 
@@ -43,7 +43,7 @@ def test_the_proximal_step_solves_the_guidance_equation_with_the_local_mean_held
     mean, fine = field.local_mean(x).double(), x.double()
     for _ in range(20_000):
         fine = fine + scale * dt / 20_000 * (mean - fine) / field.bandwidth**2
-    torch.testing.assert_close(make_guide(field, scale)(x, x, dt).double(), fine, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(make_guide(field, scale)(x, x, x, dt).double(), fine, rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize("alpha", [0.0, -3.0])
@@ -55,7 +55,7 @@ def test_the_proximal_step_tends_to_the_euler_step_as_lambda_tends_to_zero(alpha
         x = torch.randn(100, 2)
     difference, step = [], []
     for scale in (1e-2, 1e-3):
-        euler, proximal = (make_guide(field, scale, name)(x, x, 0.2) for name in ("euler", "proximal"))
+        euler, proximal = (make_guide(field, scale, name)(x, x, x, 0.2) for name in ("euler", "proximal"))
         difference.append((euler - proximal).norm().item())
         step.append((euler - x).norm().item())
     assert len(x) > 5
@@ -68,7 +68,7 @@ def test_the_proximal_step_tends_to_the_euler_step_as_lambda_tends_to_zero(alpha
 def test_the_proximal_step_stays_among_the_anchors_however_large_lambda(scale):
     field = random_field(3)
     x_t, x_next = torch.randn(50, 3), 2 * torch.randn(50, 3)
-    guided = make_guide(field, scale)(x_t, x_next, 0.2)
+    guided = make_guide(field, scale)(x_t, x_next, x_next, 0.2)
     mean = field.local_mean(x_next)
     decay = math.exp(-scale * 0.2 / field.bandwidth**2)
     torch.testing.assert_close(guided - mean, decay * (x_next - mean), rtol=1e-4, atol=1e-5)
@@ -94,8 +94,8 @@ def test_the_proximal_distance_step_ends_at_most_at_the_safe_anchor(scale):
     field, dt = random_field(2, -2.0, bandwidth=0.1), 0.2
     without = PotentialField(field.anchors, field.bandwidth, field.log_threshold)
     x = 3 * torch.randn(100, 2)
-    before = make_guide(without, scale)(x, x, dt)
-    after = make_guide(field, scale)(x, x, dt)
+    before = make_guide(without, scale)(x, x, x, dt)
+    after = make_guide(field, scale)(x, x, x, dt)
     offset = field.offset_to_safe_set(before)
     moved = after - before
     assert (offset.norm(dim=-1) > 0).any()
@@ -108,7 +108,7 @@ def test_the_proximal_distance_step_ends_at_most_at_the_safe_anchor(scale):
 
 def test_a_tiny_alpha_does_not_divide_zero_by_zero():
     field = random_field(2, -1e-30)
-    guided = make_guide(field, 1e-20)(field.anchors, field.anchors, 0.2)
+    guided = make_guide(field, 1e-20)(field.anchors, field.anchors, field.anchors, 0.2)
     torch.testing.assert_close(guided, field.anchors)
 
 
@@ -117,7 +117,7 @@ def test_a_tiny_alpha_does_not_divide_zero_by_zero():
 def test_a_guided_step_raises_the_log_density(integrator, scale, alpha):
     field = random_field(2, alpha)
     x = torch.cat([2 * torch.randn(200, 2), 10 * torch.randn(200, 2)])
-    guided = make_guide(field, scale, integrator)(x, x, 0.2)
+    guided = make_guide(field, scale, integrator)(x, x, x, 0.2)
     unsafe = field.offset_to_safe_set(x).norm(dim=-1) > 0.1
     assert unsafe.sum() > 200
     assert (field.log_density(guided) > field.log_density(x))[unsafe].all()
@@ -131,8 +131,8 @@ def test_dimensions_without_a_field_pass_bit_for_bit(integrator, dims):
     field = random_field(len(dims), -1.0)
     x_t, x_next = torch.randn(4, 8, 4), torch.randn(4, 8, 4)
     before = x_next.clone()
-    guided = make_guide(field, 0.05, integrator, dims)(x_t, x_next, 0.2)
-    alone = make_guide(field, 0.05, integrator)(x_t[..., list(dims)], x_next[..., list(dims)], 0.2)
+    guided = make_guide(field, 0.05, integrator, dims)(x_t, x_next, x_next, 0.2)
+    alone = make_guide(field, 0.05, integrator)(x_t[..., list(dims)], *2 * [x_next[..., list(dims)]], 0.2)
     others = [dim for dim in range(4) if dim not in dims]
     assert torch.equal(guided[..., others], x_next[..., others])
     assert torch.equal(guided[..., list(dims)], alone)
@@ -158,8 +158,8 @@ def test_guides_work_under_inference_mode_and_autocast(integrator):
     field = random_field(2, -1.0)
     x_t, x_next = torch.randn(4, 8, 3), torch.randn(4, 8, 3)
     guide = make_guide(field, 0.05, integrator, [2, 1])
-    expected = guide(x_t, x_next, 0.2)
+    expected = guide(x_t, x_next, x_next, 0.2)
     with torch.inference_mode():
-        assert torch.equal(guide(x_t, x_next, 0.2), expected)
+        assert torch.equal(guide(x_t, x_next, x_next, 0.2), expected)
     with torch.autocast("cpu", torch.bfloat16):
-        assert torch.equal(guide(x_t, x_next, 0.2), expected)
+        assert torch.equal(guide(x_t, x_next, x_next, 0.2), expected)

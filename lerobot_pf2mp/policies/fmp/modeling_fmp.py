@@ -126,6 +126,7 @@ class FMPPolicy(PreTrainedPolicy):
         batch: dict[str, Any],
         noise: Tensor | None = None,
         generator: torch.Generator | None = None,
+        guide: Guide | None = None,
         **kwargs: Any,
     ) -> Tensor:
         """The next `n_action_steps` actions, ``(B, n_action_steps, action_dim)`` [normalised].
@@ -135,6 +136,7 @@ class FMPPolicy(PreTrainedPolicy):
                 `n_obs_steps` > 1.
             noise: ``(B, horizon, action_dim)`` prior sample x_0; drawn from N(0, I) if None.
             generator: Source of randomness for that draw.
+            guide: Bends every step, in place of the configured guidance; None for that.
             **kwargs: Ignored, for callers that pass other policies' options.
         """
         network = self.inference_network
@@ -149,7 +151,7 @@ class FMPPolicy(PreTrainedPolicy):
             noise.to(device=condition.device, dtype=torch.float32),
             self.config.num_inference_steps,
             integrator=self.config.integrator,
-            guide=self._make_guide(batch),
+            guide=guide or self.make_guide(batch),
         )  # (B, T, A)
         start = self.config.n_obs_steps - 1
         return chunk[:, start : start + self.config.n_action_steps]
@@ -180,7 +182,8 @@ class FMPPolicy(PreTrainedPolicy):
             self._queues[ACTION].extend(chunk.unbind(dim=1))
         return self._queues[ACTION].popleft()
 
-    def _make_guide(self, batch: dict[str, Any]) -> Guide | None:
+    def make_guide(self, batch: dict[str, Any]) -> Guide | None:
+        """What bends the flow for this batch: nothing."""
         return None
 
     @property

@@ -1,66 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """Configuration of the Potential Field-Guided Flow Matching Policy."""
 
-import math
 from dataclasses import dataclass
 
 from lerobot.configs import PreTrainedConfig
 
-from lerobot_pf2mp.guidance import GUIDANCE_INTEGRATORS
 from lerobot_pf2mp.policies.fmp.configuration_fmp import FMPConfig
-from lerobot_pf2mp.potential_field_processor import FieldSettings
+from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
 
 
 @PreTrainedConfig.register_subclass("pf2mp")
 @dataclass
-class PF2MPConfig(FMPConfig):
+class PF2MPConfig(GuidedConfig, FMPConfig):
     """Configuration of PF2MP (Section IV-B of the paper): FMP and a potential field that guides its inference.
 
-    The field is a density over actions, so the actions it covers must be positions in the place that holds the
-    obstacles (ball, gripper or joint positions). A density over displacements says nothing about obstacles.
-
-    All values below can be changed at evaluation, for example with ``--policy.guidance_scale=0.4``; all but
-    `field_action_dims` then take effect without training.
-
-    Args:
-        guidance_scale: lambda, the strength of the guidance; 0 is exactly FMP.
-        guidance_integrator: proximal (solved exactly over a step, flat in lambda) or euler (Algorithm 2 as printed).
-        n_field_points: Demonstrated actions M kept as anchors of the field.
-        field_action_dims: Action dimensions the field covers; None covers all. A gripper's opening is usually left out.
-        field_bandwidth: Kernel bandwidth h [normalised action units], or how to choose it: likelihood (leave-one-out
-            maximum likelihood), scott or silverman.
-        field_threshold_quantile: Quantile of the anchors' own densities above which an action counts as safe.
-        field_alpha: Weight of the distance to the safe set, at most 0; 0 leaves that term out.
+    The arguments are those of `FMPConfig`, about network, flow and training, and of `GuidedConfig`, about guidance.
     """
-
-    guidance_scale: float = 0.8
-    guidance_integrator: str = "proximal"
-    n_field_points: int = 3000
-    field_action_dims: tuple[int, ...] | None = None
-    field_bandwidth: float | str = "likelihood"
-    field_threshold_quantile: float = 0.01
-    field_alpha: float = -0.1
 
     def _validate(self) -> None:
         super()._validate()
-        if not (self.guidance_scale >= 0 and math.isfinite(self.guidance_scale)):
-            raise ValueError(f"guidance_scale must be finite and at least 0, got {self.guidance_scale}")
-        if self.guidance_integrator not in GUIDANCE_INTEGRATORS:
-            raise ValueError(
-                f"guidance_integrator must be one of {GUIDANCE_INTEGRATORS}, got {self.guidance_integrator!r}"
-            )
-        _ = self.field_settings  # validates the field's own values
-
-    @property
-    def field_settings(self) -> FieldSettings:
-        """What the potential field is fitted with."""
-        return FieldSettings(
-            n_points=self.n_field_points,
-            action_dims=self.field_action_dims,
-            bandwidth=self.field_bandwidth,
-            threshold_quantile=self.field_threshold_quantile,
-            alpha=self.field_alpha,
-        )
+        self._validate_guidance()
 
     def validate_features(self) -> None:
         """Checks the features, and that the field's dimensions are among the action's.
@@ -69,8 +28,4 @@ class PF2MPConfig(FMPConfig):
             ValueError: If they do not fit.
         """
         super().validate_features()
-        action_dim = self.action_feature.shape[0]
-        if self.field_action_dims is not None and max(self.field_action_dims) >= action_dim:
-            raise ValueError(
-                f"field_action_dims must be below the action dimension {action_dim}, got {self.field_action_dims}"
-            )
+        self._validate_field_dims(self.action_feature)

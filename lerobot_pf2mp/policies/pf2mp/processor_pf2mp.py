@@ -1,30 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The processors of PF2MP: LeRobot's default ones, and the potential field at the end of the preprocessor."""
+"""The processors of PF2MP, under the name by which LeRobot looks for them."""
 
-from dataclasses import asdict
-from typing import Any
+from lerobot_pf2mp.policies.guided.processor_guided import (
+    make_guided_pre_post_processors as make_pf2mp_pre_post_processors,
+)
 
-from lerobot.processor import PolicyAction, PolicyProcessorPipeline, make_default_pre_post_processors
-
-from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
-from lerobot_pf2mp.potential_field_processor import PotentialFieldProcessorStep
-
-
-def make_pf2mp_pre_post_processors(
-    config: PF2MPConfig, dataset_stats: dict[str, dict[str, Any]] | None = None
-) -> tuple[
-    PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
-    PolicyProcessorPipeline[PolicyAction, PolicyAction],
-]:
-    """The pipelines before the policy (rename, batch, device, normalise, potential field) and after it.
-
-    Args:
-        config: The policy's configuration.
-        dataset_stats: Statistics that the normalisation uses.
-
-    Returns:
-        The preprocessor and the postprocessor.
-    """
-    preprocessor, postprocessor = make_default_pre_post_processors(config, dataset_stats)
-    preprocessor.steps.append(PotentialFieldProcessorStep(**asdict(config.field_settings)))
-    return preprocessor, postprocessor
+__all__ = ["make_pf2mp_pre_post_processors"]

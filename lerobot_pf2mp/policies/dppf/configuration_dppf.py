@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Configuration of the Diffusion Policy with Potential Field Guidance."""
+
+from dataclasses import dataclass
+
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
+
+from lerobot_pf2mp.errors import reported_on_the_command_line
+from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
+
+
+@PreTrainedConfig.register_subclass("dppf")
+@dataclass
+class DPPFConfig(GuidedConfig, DiffusionConfig):
+    """Configuration of DPPF (Section V of the paper): LeRobot's Diffusion Policy with PF2MP's guidance.
+
+    The arguments are those of LeRobot's `DiffusionConfig` and of `GuidedConfig`. The defaults differ from the former in
+    the sampler, as in the paper's comparison:
+
+    Args:
+        noise_scheduler_type: DDIM (deterministic, for few steps) or DDPM.
+        num_inference_steps: Denoising steps N; None for all `num_train_timesteps`.
+    """
+
+    noise_scheduler_type: str = "DDIM"
+    num_inference_steps: int | None = 5
+
+    def __post_init__(self) -> None:
+        """Validates the values.
+
+        Raises:
+            ConfigError: If one breaks its rule.
+        """
+        with reported_on_the_command_line():
+            super().__post_init__()
+            self._validate_guidance()
+            n_steps = self.num_inference_steps
+            if n_steps is not None and not 1 <= n_steps <= self.num_train_timesteps:
+                raise ValueError(
+                    f"num_inference_steps must lie in 1 to num_train_timesteps={self.num_train_timesteps}, got {n_steps}"
+                )
+
+    def validate_features(self) -> None:
+        """Checks the features, and that the field's dimensions are among the action's.
+
+        Raises:
+            ValueError: If they do not fit.
+        """
+        super().validate_features()
+        self._validate_field_dims(self.action_feature)

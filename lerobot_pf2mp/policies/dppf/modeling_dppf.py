@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""DPPF: LeRobot's Diffusion Policy, guided at inference by a potential field (the paper's baseline in Section V)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
+from torch import Tensor
+
+from lerobot_pf2mp.flow_matching import Guide
+from lerobot_pf2mp.policies.dppf.configuration_dppf import DPPFConfig
+from lerobot_pf2mp.policies.guided.modeling_guided import PotentialFieldGuidance
+
+
+class DPPFPolicy(DiffusionPolicy):
+    """Differs from `DiffusionPolicy` by a guide in the denoising loop, and by showing the field what it learns from.
+
+    The weights are those of `DiffusionPolicy`. With ``guidance_scale=0`` nothing of its code is changed.
+
+    Args:
+        config: The policy's configuration.
+        dataset_stats: Statistics of the training dataset; None at evaluation.
+        dataset_meta: Its metadata (not used).
+    """
+
+    config_class = DPPFConfig
+    name = "dppf"
+    config: DPPFConfig
+
+    def __init__(
+        self,
+        config: DPPFConfig,
+        dataset_stats: dict[str, dict[str, Any]] | None = None,
+        dataset_meta: Any = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(config)
+        self._guidance = PotentialFieldGuidance(config, dataset_stats)
+
+    def forward(self, batch: dict[str, Any]) -> tuple[Tensor, None]:
+        """The loss of `DiffusionPolicy.forward`; in training, the batch's actions also go to the potential field."""
+        if self.training and torch.is_grad_enabled():
+            self._guidance.observe(batch)
+        return super().forward(batch)
+
+    @torch.no_grad()
+    def predict_action_chunk(
+        self, batch: dict[str, Any], noise: Tensor | None = None, guide: Guide | None = None
+    ) -> Tensor:
+        """The next `n_action_steps` actions, ``(B, n_action_steps, action_dim)`` [normalised].
+
+        Args:
+            batch: Normalised observations, as for `DiffusionPolicy.predict_action_chunk`, with the potential field.
+            noise: ``(B, horizon, action_dim)`` the sample to denoise; drawn from N(0, I) if None.
+            guide: Bends every denoising step, in place of the configured guidance; None for that.
+        """
+        with self._guided(guide or self.make_guide(batch)):
+            return super().predict_action_chunk(batch, noise=noise)
+
+    def make_guide(self, batch: dict[str, Any]) -> Guide | None:
+        """The configured guide over the field in the batch; None with ``guidance_scale=0``.
+
+        Raises:
+            ValueError: If the batch holds no field, or one over other dimensions.
+        """
+        return self._guidance.make_guide(batch, next(self.parameters()).device)
+
+    @contextmanager
+    def _guided(self, guide: Guide | None) -> Iterator[None]:
+        scheduler = self.diffusion.noise_scheduler
+        if guide is not None:
+            self.diffusion.noise_scheduler = _GuidedScheduler(scheduler, guide)
+        try:
+            yield
+        finally:
+            self.diffusion.noise_scheduler = scheduler
+
+
+class _GuidedScheduler:
+    """A noise scheduler of diffusers, every step of which is bent by a guide.
+
+    Each of the N denoising steps counts as dt = 1/N of the guidance, as the flow's do.
+    """
+
+    def __init__(self, scheduler: Any, guide: Guide) -> None:
+        self._scheduler = scheduler
+        self._guide = guide
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._scheduler, name)
+
+    def step(self, model_output: Tensor, timestep: int, sample: Tensor, **kwargs: Any) -> Any:
+        output = self._scheduler.step(model_output, timestep, sample, **kwargs)
+        dt = 1 / len(self._scheduler.timesteps)
+        output.prev_sample = self._guide(sample, output.prev_sample, output.pred_original_sample, dt)
+        return output

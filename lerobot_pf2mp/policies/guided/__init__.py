@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every policy guided by a potential field has in common."""

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a policy learns which actions were demonstrated, and gets a guide from their potential field."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from lerobot.utils.constants import ACTION
+
+from lerobot_pf2mp.flow_matching import Guide
+from lerobot_pf2mp.guidance import make_guide
+from lerobot_pf2mp.potential_field_processor import POTENTIAL_FIELD, DemonstratedActions
+
+if TYPE_CHECKING:
+    from lerobot_pf2mp.policies.dppf.configuration_dppf import DPPFConfig
+    from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
+
+    GuidedPolicyConfig = PF2MPConfig | DPPFConfig
+
+
+class PotentialFieldGuidance:
+    """The potential field as one policy uses it.
+
+    Args:
+        config: The policy's configuration.
+        dataset_stats: Statistics of the training dataset; None at evaluation.
+    """
+
+    def __init__(
+        self, config: GuidedPolicyConfig, dataset_stats: dict[str, dict[str, Any]] | None = None
+    ) -> None:
+        self.config = config
+        self._dataset_id = _identify_dataset(dataset_stats, config)
+
+    def observe(self, batch: dict[str, Any]) -> None:
+        """Shows a training batch's actions to the field that the preprocessor put into it; without one, does nothing."""
+        demonstrations = batch.get(POTENTIAL_FIELD)
+        if demonstrations is None:
+            return
+        frames = batch.get("index")
+        demonstrations.observe(
+            batch[ACTION],
+            batch.get(f"{ACTION}_is_pad"),
+            None if frames is None else frames + (1 - self.config.n_obs_steps),
+            settings=self.config.field_settings,
+            dataset_id=self._dataset_id,
+        )
+
+    def make_guide(self, batch: dict[str, Any], device: torch.device) -> Guide | None:
+        """The configured guide over the batch's field; None with a guidance scale of 0.
+
+        Args:
+            batch: A batch that the policy's own preprocessor has made.
+            device: Where the guide is used.
+
+        Raises:
+            ValueError: If the batch holds no field, or one over other dimensions.
+        """
+        config = self.config
+        if config.guidance_scale == 0:
+            return None
+        demonstrations = batch.get(POTENTIAL_FIELD)
+        if not isinstance(demonstrations, DemonstratedActions):
+            raise ValueError(
+                f"guidance needs the potential field, which the policy's own preprocessor puts under {POTENTIAL_FIELD!r}; "
+                "got a batch without it. Load the preprocessor from the checkpoint, or set guidance_scale=0"
+            )
+        field = demonstrations.field(config.field_settings, device)
+        dims = config.field_action_dims
+        n_dims = config.action_feature.shape[0] if dims is None else len(dims)
+        if field.dim != n_dims:
+            raise ValueError(
+                f"the potential field must cover {n_dims} action dimensions, got a field over {field.dim}: it belongs to "
+                "another policy"
+            )
+        return make_guide(
+            field, config.guidance_scale, config.guidance_integrator, dims, config.guidance_point
+        )
+
+
+def _identify_dataset(dataset_stats: dict[str, dict[str, Any]] | None, config: GuidedPolicyConfig) -> bytes:
+    """A digest of the action statistics and their normalisation, by which resuming and fine-tuning differ.
+
+    LeRobot reloads the saved preprocessor in both cases. With the same digest the sample goes on where it was; with
+    another one its points belong to other data, or to other units, and the sample starts afresh.
+    """
+    if not dataset_stats or ACTION not in dataset_stats:
+        return b""
+    digest = hashlib.sha256(str(config.normalization_mapping.get("ACTION")).encode())
+    for name, value in sorted(dataset_stats[ACTION].items()):
+        digest.update(name.encode())
+        digest.update(np.asarray(value, dtype=np.float64).tobytes())
+    return digest.digest()
