@@ -3,10 +3,7 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +17,8 @@ from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.io_utils import write_info, write_stats
 from lerobot.datasets.utils import update_chunk_file_indices
 from lerobot.utils.utils import flatten_dict
+
+from lerobot_pf2mp.written_beside import written_beside
 
 
 @dataclass(frozen=True)
@@ -39,51 +38,6 @@ class DatasetSpec:
     features: dict[str, dict[str, Any]]
     task: str
     card: str
-
-
-@contextmanager
-def written_beside(root: Path, overwrite: bool) -> Iterator[Path]:
-    """A temporary folder beside `root` that takes its place at the end, and vanishes if anything goes wrong.
-
-    Args:
-        root: The folder to be written.
-        overwrite: Whether a folder already there is replaced.
-
-    Yields:
-        The path of the temporary folder, which does not exist yet.
-
-    Raises:
-        FileExistsError: If `root` exists and `overwrite` is false.
-    """
-    root = Path(root)
-    if root.exists():
-        if not overwrite:
-            raise FileExistsError(f"{root} exists already: choose another --root, or pass --overwrite=true")
-        if not (root / "meta/info.json").is_file():
-            raise FileExistsError(
-                f"{root} is not a dataset and will not be overwritten: choose another --root"
-            )
-    root.parent.mkdir(parents=True, exist_ok=True)
-    workspace = Path(tempfile.mkdtemp(prefix=f".{root.name}.", suffix=".partial", dir=root.parent))
-    try:
-        partial = workspace / "new"
-        yield partial
-        _swap(partial, root, spare=workspace / "old")
-    finally:
-        shutil.rmtree(workspace, ignore_errors=True)
-
-
-def _swap(new: Path, root: Path, spare: Path) -> None:
-    """Puts `new` in the place of `root`; if that fails, `root` is as before."""
-    if not root.exists():
-        new.rename(root)
-        return
-    root.rename(spare)
-    try:
-        new.rename(root)
-    except BaseException:
-        spare.rename(root)
-        raise
 
 
 def write_dataset(
@@ -107,7 +61,7 @@ def write_dataset(
         FileExistsError: If `root` exists and `overwrite` is false.
         ValueError: If there is no episode, or an array is not finite or of the wrong shape.
     """
-    with written_beside(root, overwrite) as partial:
+    with written_beside(root, overwrite, mark="meta/info.json", option="--root") as partial:
         meta = LeRobotDatasetMetadata.create(
             spec.repo_id,
             fps=spec.fps,

@@ -33,6 +33,21 @@ def load_policy(
     Raises:
         FileNotFoundError: If there is neither such a folder nor such a repository.
     """
+    config = load_config(path, revision=revision, device=device, **overrides)
+    policy = get_policy_class(config.type).from_pretrained(path, config=config, revision=revision)
+    preprocessor, postprocessor = make_pre_post_processors(
+        config,
+        pretrained_path=str(path),
+        pretrained_revision=revision,
+        preprocessor_overrides={"device_processor": {"device": config.device}},
+    )
+    return policy, preprocessor, postprocessor
+
+
+def load_config(
+    path: str | Path, *, revision: str | None = None, device: str | None = None, **overrides: Any
+) -> PreTrainedConfig:
+    """Loads a checkpoint's configuration; the arguments and errors are those of `load_policy`."""
     is_repository_name = len(Path(path).parts) == 2 and not Path(path).is_absolute()
     if not Path(path).is_dir() and not is_repository_name:
         raise FileNotFoundError(
@@ -44,11 +59,4 @@ def load_policy(
     config = PreTrainedConfig.from_pretrained(path, revision=revision, cli_overrides=options)
     # LeRobot leaves this empty; without it the processors would be built anew, with neither statistics nor field.
     config.pretrained_path = Path(path)
-    policy = get_policy_class(config.type).from_pretrained(path, config=config, revision=revision)
-    preprocessor, postprocessor = make_pre_post_processors(
-        config,
-        pretrained_path=str(path),
-        pretrained_revision=revision,
-        preprocessor_overrides={"device_processor": {"device": config.device}},
-    )
-    return policy, preprocessor, postprocessor
+    return config

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gives a trained policy a potential field without retraining: diffusion becomes dppf, fmp becomes pf2mp."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.lerobot_types import TransitionKey
+from lerobot.policies import make_pre_post_processors
+from lerobot.policies.factory import get_policy_class
+from lerobot.processor import NormalizerProcessorStep, PolicyProcessorPipeline
+from lerobot.utils.constants import ACTION
+from torch import Tensor
+from tqdm import tqdm
+
+from lerobot_pf2mp.loading import load_config
+from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
+from lerobot_pf2mp.potential_field_processor import PotentialFieldProcessorStep
+from lerobot_pf2mp.written_beside import written_beside
+
+GUIDED_TYPES = {"fmp": "pf2mp", "pf2mp": "pf2mp", "diffusion": "dppf", "dppf": "dppf"}
+
+_FRAMES_AT_ONCE = 65536
+
+
+def fit_field(
+    checkpoint: str | Path,
+    output_dir: Path,
+    *,
+    repo_id: str,
+    root: Path | None = None,
+    episodes: Sequence[int] | None = None,
+    dataset_revision: str | None = None,
+    checkpoint_revision: str | None = None,
+    options: dict[str, Any] | None = None,
+    overwrite: bool = False,
+) -> PreTrainedConfig:
+    """Writes a new checkpoint: the same weights, guided by the field of a dataset's actions.
+
+    The actions are normalised as the checkpoint was trained, so that the field lives where its policy generates. The
+    anchors are those that training on all frames would have kept.
+
+    Args:
+        checkpoint: A ``pretrained_model`` folder or a repository on the Hub, of a type in `GUIDED_TYPES`.
+        output_dir: The folder to write.
+        repo_id: Name of the LeRobotDataset.
+        root: Its folder; None for LeRobot's cache, filled from the Hub.
+        episodes: Episodes to use; None for all.
+        dataset_revision: Branch, tag or commit of the dataset on the Hub.
+        checkpoint_revision: Branch, tag or commit of the checkpoint on the Hub.
+        options: Fields of `GuidedConfig` to change.
+        overwrite: Whether a checkpoint already at `output_dir` is replaced.
+
+    Returns:
+        The new policy's configuration.
+
+    Raises:
+        ValueError: If the checkpoint is of another type, its actions are not the dataset's, or an option breaks its rule.
+        FileNotFoundError: If the checkpoint does not exist or lacks its preprocessor.
+        FileExistsError: If `output_dir` exists and `overwrite` is false.
+    """
+    config = load_config(checkpoint, revision=checkpoint_revision, device="cpu")
+    guided = _guided_config(config, options or {})
+    with written_beside(output_dir, overwrite, mark="config.json", option="--output_dir") as partial:
+        policy_class = get_policy_class(guided.type)
+        policy = policy_class.from_pretrained(checkpoint, config=guided, revision=checkpoint_revision)
+        preprocessor, postprocessor = make_pre_post_processors(
+            config,
+            pretrained_path=str(checkpoint),
+            pretrained_revision=checkpoint_revision,
+            preprocessor_overrides={"device_processor": {"device": "cpu"}},
+        )
+        dataset = LeRobotDataset(
+            repo_id,
+            root=root,
+            episodes=None if episodes is None else list(episodes),
+            revision=dataset_revision,
+            download_videos=False,
+        )
+        step = _fitted_step(guided, dataset, preprocessor)
+        preprocessor.steps = [
+            *(old for old in preprocessor.steps if not isinstance(old, PotentialFieldProcessorStep)),
+            step,
+        ]
+        for part in (policy, preprocessor, postprocessor):
+            part.save_pretrained(partial)
+    return guided
+
+
+def _guided_config(config: PreTrainedConfig, options: dict[str, Any]) -> PreTrainedConfig:
+    if config.type not in GUIDED_TYPES:
+        raise ValueError(f"the checkpoint's type must be one of {list(GUIDED_TYPES)}, got {config.type!r}")
+    guided_class = PreTrainedConfig.get_choice_class(GUIDED_TYPES[config.type])
+    values = {field.name: getattr(config, field.name) for field in fields(config) if field.init}
+    return guided_class(**{**values, **options})
+
+
+def _fitted_step(
+    config: PreTrainedConfig, dataset: LeRobotDataset, preprocessor: PolicyProcessorPipeline
+) -> PotentialFieldProcessorStep:
+    """The preprocessor's step with the field of the dataset's actions."""
+    wanted = config.action_feature.shape
+    shape = tuple(dataset.meta.features.get(ACTION, {}).get("shape", ()))
+    if shape != tuple(wanted):
+        raise ValueError(f"the dataset's action must have the policy's shape {tuple(wanted)}, got {shape}")
+    settings = cast(GuidedConfig, config).field_settings
+    step = PotentialFieldProcessorStep(**asdict(settings))
+    frames = dataset.hf_dataset.with_format("numpy", columns=[ACTION, "index"])
+    starts = range(0, len(frames), _FRAMES_AT_ONCE)
+    for start in tqdm(starts, desc="Reading actions", unit="block", disable=len(starts) < 2):
+        block = frames[start : start + _FRAMES_AT_ONCE]
+        actions = torch.from_numpy(np.array(block[ACTION], dtype=np.float32)).reshape(-1, 1, *shape)
+        # No dataset is named: training that goes on from here starts the field afresh, from what it then learns from.
+        step.demonstrations.observe(
+            _normalise(actions, preprocessor), None, torch.from_numpy(block["index"]), settings=settings
+        )
+    step.demonstrations.field()  # nothing to observe is an error now rather than at inference
+    return step
+
+
+def _normalise(actions: Tensor, preprocessor: PolicyProcessorPipeline) -> Tensor:
+    transition: Any = {TransitionKey.ACTION: actions}
+    for step in preprocessor.steps:
+        if isinstance(step, NormalizerProcessorStep):
+            transition = step(transition)
+    return transition[TransitionKey.ACTION]

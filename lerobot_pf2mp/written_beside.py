@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Writes folders that appear whole or not at all."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def written_beside(folder: Path, overwrite: bool, *, mark: str, option: str) -> Iterator[Path]:
+    """A temporary folder beside `folder` that takes its place at the end, and vanishes if anything goes wrong.
+
+    Args:
+        folder: The folder to be written.
+        overwrite: Whether a folder already there is replaced.
+        mark: A file inside by which a folder that may be replaced is known.
+        option: The command-line option that chose the folder, for error messages.
+
+    Yields:
+        The path of the temporary folder, which does not exist yet.
+
+    Raises:
+        FileExistsError: If the folder exists and `overwrite` is false, or it is of another kind.
+    """
+    folder = Path(folder)
+    if folder.exists():
+        if not overwrite:
+            raise FileExistsError(
+                f"{folder} exists already: choose another {option}, or pass --overwrite=true"
+            )
+        if not (folder / mark).is_file():
+            raise FileExistsError(
+                f"{folder} holds no {mark} and will not be overwritten: choose another {option}"
+            )
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    workspace = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".partial", dir=folder.parent))
+    try:
+        partial = workspace / "new"
+        yield partial
+        _swap(partial, folder, spare=workspace / "old")
+    finally:
+        shutil.rmtree(workspace, ignore_errors=True)
+
+
+def _swap(new: Path, folder: Path, spare: Path) -> None:
+    """Puts `new` in the place of `folder`; if that fails, `folder` is as before."""
+    if not folder.exists():
+        new.rename(folder)
+        return
+    folder.rename(spare)
+    try:
+        new.rename(folder)
+    except BaseException:
+        spare.rename(folder)
+        raise
