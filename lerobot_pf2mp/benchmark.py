@@ -1,26 +1,59 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compares kinds of guidance of one checkpoint on the same episodes, with LeRobot's own evaluation."""
+"""Compares policies on the same episodes: tasks x policies x guidance x training seeds x repeats, one row an episode.
+
+Every policy gets the same start-goal pairs and, in each repeat, the same prior noise, so that policies can be compared
+pair by pair. Evaluation is LeRobot's own, on vectorised environments.
+"""
 
 from __future__ import annotations
 
-import csv
+import io
+import json
+import multiprocessing
 import os
 import platform
 import statistics
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+import subprocess
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager, redirect_stderr
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 from lerobot.envs import make_env_pre_post_processors
 from lerobot.envs.configs import EnvConfig
+from lerobot.envs.utils import NEW_ROLLOUT_OPTION, preprocess_observation
+from lerobot.policies import PreTrainedPolicy
 from lerobot.scripts.lerobot_eval import eval_policy
 from tqdm import tqdm
 
+from lerobot_pf2mp.episode_recorder import EpisodeRecorder
 from lerobot_pf2mp.guidance import GUIDANCE_INTEGRATORS
-from lerobot_pf2mp.loading import load_policy
-from lerobot_pf2mp.rate import Rate
+from lerobot_pf2mp.loading import load_config, load_policy
+from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
+from lerobot_pf2mp.results import (
+    NO_GUIDANCE,
+    EpisodeRow,
+    SummaryRow,
+    format_row,
+    group_cells,
+    read_rows,
+    summarise,
+    write_rows,
+)
+from lerobot_pf2mp.tables import make_latex, make_markdown
+
+# What a guided policy is called when guidance is off.
+UNGUIDED_NAMES = {"pf2mp": "fmp", "dppf": "dp"}
+
+_N_LATENCY_CALLS = 11
 
 
 @dataclass(frozen=True)
@@ -28,167 +61,384 @@ class Guidance:
     """One kind of guidance.
 
     Args:
-        integrator: One of `GUIDANCE_INTEGRATORS`.
-        scale: lambda; 0 is no guidance, the plain flow matching policy.
+        integrator: One of `GUIDANCE_INTEGRATORS`, or none.
+        scale: lambda; 0 without guidance.
     """
 
     integrator: str
     scale: float
 
     @classmethod
-    def parse(cls, text: str) -> Guidance:
-        """Reads ``fmp`` (no guidance) or ``INTEGRATOR:SCALE``, for example ``proximal:0.8``.
+    def parse(cls, text: str) -> list[Guidance]:
+        """Reads ``none``, or ``INTEGRATOR:SCALE,SCALE,...``, for example ``proximal:0.08,0.8``.
 
         Raises:
             ValueError: If the text is neither.
         """
-        if text == "fmp":
-            return cls(GUIDANCE_INTEGRATORS[0], 0.0)
-        integrator, _, scale = text.partition(":")
+        if text == NO_GUIDANCE:
+            return [NONE]
+        integrator, _, scales = text.partition(":")
         try:
-            value = float(scale)
+            values = [float(scale) for scale in scales.split(",")]
         except ValueError:
-            value = -1.0
-        if integrator not in GUIDANCE_INTEGRATORS or not value > 0:
+            values = [-1.0]
+        if integrator not in GUIDANCE_INTEGRATORS or not all(0 < value < float("inf") for value in values):
             raise ValueError(
-                f"guidance must be fmp or INTEGRATOR:SCALE with an integrator of {GUIDANCE_INTEGRATORS} and a "
-                f"positive scale, got {text!r}"
+                f"guidance must be none or INTEGRATOR:SCALE,SCALE,... with an integrator of {GUIDANCE_INTEGRATORS} and "
+                f"positive scales, got {text!r}"
             )
-        return cls(integrator, value)
+        return [cls(integrator, value) for value in values]
+
+
+NONE = Guidance(NO_GUIDANCE, 0.0)
 
 
 @dataclass(frozen=True)
-class Result:
-    """The outcome of one repeat: the same episodes for every kind of guidance, other noise for every repeat.
+class BenchmarkSpec:
+    """What to compare.
 
     Args:
-        task: The environment's task.
-        policy: fmp without guidance, pf2mp with it.
-        guidance_integrator: Its integrator; empty without guidance.
-        guidance_scale: lambda.
-        seed: Seed of the first episode's start and goal; episode i has seed + i.
-        repeat: Number of the repeat; the noise of the policy is seeded with it.
-        n_episodes: Episodes.
-        collisions: Episodes with a collision.
-        successes: Episodes that reached the goal.
+        env: The environments' configuration.
+        tasks: Its tasks.
+        policies: Checkpoints (``pretrained_model`` folders or repositories on the Hub) by name. ``{task}`` and ``{seed}``
+            in a path stand for the task and the training seed. Policies of any type can be compared.
+        guidances: Kinds of guidance for policies that have one. ``none`` is their unguided twin.
+        variants: Changes to the policies' configuration by name; the name "" with no changes is the checkpoint as it is.
+        seeds: Training seeds.
+        n_repeats: Repeats with other prior noise.
+        n_episodes: Start-goal pairs, the same for all.
+        episode_seed: Seed of the first pair; pair i has `episode_seed` + i.
+        batch_size: Environments that run side by side.
+        device: Where the policies run.
+
+    Raises:
+        ValueError: If a number is not positive or there is nothing to compare.
     """
+
+    env: EnvConfig
+    tasks: tuple[str, ...]
+    policies: dict[str, str]
+    guidances: tuple[Guidance, ...]
+    variants: dict[str, dict[str, Any]]
+    seeds: tuple[int, ...] = (0,)
+    n_repeats: int = 3
+    n_episodes: int = 500
+    episode_seed: int = 100000
+    batch_size: int = 50
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        for name in ("n_repeats", "n_episodes", "batch_size"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("tasks", "policies", "guidances", "variants", "seeds"):
+            if not getattr(self, name):
+                raise ValueError(f"{name} must name at least one, got none")
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One repeat of one policy with one kind of guidance: the unit that is done or not done."""
 
     task: str
     policy: str
-    guidance_integrator: str
-    guidance_scale: float
+    checkpoint: str
+    guidance: Guidance
+    variant: str
     seed: int
     repeat: int
-    n_episodes: int
-    collisions: int
-    successes: int
 
 
-def run_benchmark(
-    checkpoint: Path,
-    env: EnvConfig,
-    guidances: Sequence[Guidance],
-    *,
-    n_episodes: int,
-    n_repeats: int,
-    seed: int,
-    batch_size: int = 50,
-) -> list[Result]:
-    """Evaluates a checkpoint once for each kind of guidance and repeat.
+def run_benchmark(spec: BenchmarkSpec, output_dir: Path, *, n_processes: int = 1) -> list[SummaryRow]:
+    """Evaluates all policies and writes ``episodes.csv``, ``summary.csv``, ``table.md``, ``table.tex`` and ``run.json``.
+
+    A benchmark that was interrupted goes on where it was; more policies, guidance, variants, seeds or repeats are added to
+    those already there.
 
     Args:
-        checkpoint: A ``pretrained_model`` folder of a pf2mp policy.
-        env: The environment.
-        guidances: The kinds of guidance to compare.
-        n_episodes: Start-goal pairs, the same for all.
-        n_repeats: Repeats with other noise.
-        seed: Seed of the first pair.
-        batch_size: Environments that run side by side.
+        spec: What to compare.
+        output_dir: Where results are written.
+        n_processes: Processes side by side. With more than one, each uses one thread.
 
     Returns:
-        One result for each kind of guidance and repeat.
+        One row for each policy, kind of guidance and repeat.
 
     Raises:
-        ValueError: If a number is not positive.
+        ValueError: If `output_dir` holds a benchmark with other episodes.
+        FileNotFoundError: If a checkpoint does not exist.
     """
-    for name, value in (("n_episodes", n_episodes), ("n_repeats", n_repeats), ("batch_size", batch_size)):
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
-    policy, preprocessor, postprocessor = load_policy(checkpoint, device="cpu")
-    env_preprocessor, env_postprocessor = make_env_pre_post_processors(env, policy.config)
-    (vector_env,) = next(iter(env.create_envs(min(batch_size, n_episodes)).values())).values()
-    cells = [(guidance, repeat) for guidance in guidances for repeat in range(n_repeats)]
-    results = []
-    for guidance, repeat in tqdm(cells, desc="Benchmark", unit="repeat"):
-        policy.config.guidance_integrator = guidance.integrator
-        policy.config.guidance_scale = guidance.scale
-        torch.manual_seed(repeat)
-        episodes = eval_policy(
-            vector_env,
-            policy,
-            env_preprocessor,
-            env_postprocessor,
-            preprocessor,
-            postprocessor,
-            n_episodes,
-            start_seed=seed,
-        )["per_episode"]
-        results.append(
-            Result(
-                task=str(env.task),
-                policy="pf2mp" if guidance.scale else "fmp",
-                guidance_integrator=guidance.integrator if guidance.scale else "",
-                guidance_scale=guidance.scale,
-                seed=seed,
-                repeat=repeat,
-                n_episodes=n_episodes,
-                collisions=sum(episode["sum_reward"] < 0 for episode in episodes),
-                successes=sum(episode["success"] for episode in episodes),
+    if n_processes < 1:
+        raise ValueError(f"n_processes must be at least 1, got {n_processes}")
+    jobs = _make_jobs(spec)
+    output_dir.mkdir(parents=True, exist_ok=True)
+    _claim(output_dir, spec)
+    episodes = output_dir / "episodes.csv"
+    done = _keep_whole_repeats(episodes, spec.n_episodes)
+    missing = [job for job in jobs if _identify(job) not in done]
+    with (
+        episodes.open("a", newline="", encoding="utf-8") as file,
+        tqdm(total=len(jobs), initial=len(jobs) - len(missing), desc="Benchmark", unit="repeat") as bar,
+    ):
+        for rows in _evaluate_all(spec, missing, n_processes):
+            file.write("".join(",".join(format_row(row)) + "\n" for row in rows))
+            file.flush()
+            bar.update()
+    summary = summarise(read_rows(episodes, EpisodeRow))
+    write_rows(output_dir / "summary.csv", summary, SummaryRow)
+    cells = group_cells(summary)
+    (output_dir / "table.md").write_text(make_markdown(cells), encoding="utf-8")
+    (output_dir / "table.tex").write_text(make_latex(cells), encoding="utf-8")
+    return summary
+
+
+def _make_jobs(spec: BenchmarkSpec) -> list[_Job]:
+    jobs = []
+    for task in spec.tasks:
+        for name, template in spec.policies.items():
+            for seed in spec.seeds:
+                checkpoint = template.replace("{task}", task).replace("{seed}", str(seed))
+                is_guided = isinstance(load_config(checkpoint), GuidedConfig)
+                guidances = spec.guidances if is_guided else (NONE,)
+                jobs += [
+                    _Job(
+                        task=task,
+                        policy=name
+                        if guidance.scale or not is_guided
+                        else UNGUIDED_NAMES.get(name, f"{name} unguided"),
+                        checkpoint=checkpoint,
+                        guidance=guidance,
+                        variant=variant,
+                        seed=seed,
+                        repeat=repeat,
+                    )
+                    for variant in spec.variants
+                    for guidance in guidances
+                    for repeat in range(spec.n_repeats)
+                ]
+    names = Counter(replace(job, checkpoint="") for job in jobs)
+    for job, count in names.items():
+        if count > 1:
+            raise ValueError(
+                f"every policy must have a name of its own, got {job.policy!r} twice (guidance {job.guidance.integrator})"
             )
-        )
-    vector_env.close()
-    return results
+    return jobs
 
 
-def write_results(path: Path, results: Iterable[Result]) -> None:
-    """Writes results as CSV, with the versions and the hardware they were made with."""
-    made_with = {
-        **{name: version(name) for name in ("lerobot", "torch", "mujoco", "gymnasium-robotics")},
-        "python": platform.python_version(),
-        "machine": f"{platform.machine()} {os.cpu_count()} cores",
+def _identify(row: _Job | EpisodeRow) -> tuple[object, ...]:
+    if isinstance(row, _Job):
+        guidance = row.guidance.integrator, row.guidance.scale
+    else:
+        guidance = row.guidance_integrator, row.guidance_scale
+    return row.task, row.policy, row.checkpoint, *guidance, row.variant, row.seed, row.repeat
+
+
+def _claim(output_dir: Path, spec: BenchmarkSpec) -> None:
+    """Marks the folder as a benchmark over these episodes, so that a later call can only go on with the same ones."""
+    mark = output_dir / "run.json"
+    episodes = {
+        "env": {
+            "type": spec.env.type,
+            **{k: v for k, v in asdict(spec.env).items() if not k.startswith("features")},
+        },
+        **{name: getattr(spec, name) for name in ("n_episodes", "episode_seed", "batch_size", "device")},
     }
-    rows = [{**asdict(result), **made_with} for result in results]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.partial")
-    with partial.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-    partial.replace(path)
+    episodes["env"].pop("task")
+    variants = spec.variants
+    if mark.exists():
+        found = json.loads(mark.read_text(encoding="utf-8"))
+        if found["episodes"] != json.loads(json.dumps(episodes)):
+            raise ValueError(
+                f"{output_dir} holds a benchmark over other episodes ({found['episodes']}), got {episodes}: choose another "
+                "--output_dir"
+            )
+        variants = {**found["variants"], **variants}
+    made_with = {
+        name: version(name) for name in ("lerobot", "torch", "mujoco", "gymnasium-robotics", "diffusers")
+    }
+    content = {
+        "episodes": episodes,
+        "variants": variants,
+        "made_with": {
+            **made_with,
+            "python": platform.python_version(),
+            "machine": _describe_machine(spec.device),
+        },
+    }
+    mark.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
-def make_table(results: Iterable[Result]) -> str:
-    """A Markdown table: mean and standard deviation over the repeats [%], and the 95 % interval of all episodes."""
-    cells: dict[tuple[str, str, float], list[Result]] = {}
-    for result in results:
-        key = (result.task, result.guidance_integrator, result.guidance_scale)
-        cells.setdefault(key, []).append(result)
-    lines = [
-        "| task | policy | guidance | lambda | collision rate [%] | 95 % interval | success rate [%] | episodes |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for (task, integrator, scale), repeats in cells.items():
-        n_episodes = sum(result.n_episodes for result in repeats)
-        low, high = Rate(sum(result.collisions for result in repeats), n_episodes).interval
-        collision = _mean_and_deviation([100 * result.collisions / result.n_episodes for result in repeats])
-        success = _mean_and_deviation([100 * result.successes / result.n_episodes for result in repeats])
-        lines.append(
-            f"| {task} | {repeats[0].policy} | {integrator or 'none'} | {scale:g} | {collision} "
-            f"| {100 * low:.2f} to {100 * high:.2f} | {success} | {len(repeats)} x {repeats[0].n_episodes} |"
-        )
-    return "\n".join(lines)
+def _describe_machine(device: str) -> str:
+    cpu = f"{platform.machine()}, {os.cpu_count()} cores"
+    return f"{cpu}, {torch.cuda.get_device_name(device)}" if device.startswith("cuda") else cpu
 
 
-def _mean_and_deviation(values: list[float]) -> str:
-    deviation = statistics.stdev(values) if len(values) > 1 else 0.0
-    return f"{statistics.mean(values):.2f} ± {deviation:.2f}"
+def _keep_whole_repeats(path: Path, n_episodes: int) -> set[tuple[object, ...]]:
+    """Removes repeats that a kill has cut short from the file, and returns what is whole."""
+    rows = read_rows(path, EpisodeRow) if path.exists() else []
+    counts = Counter(map(_identify, rows))
+    whole = {key for key, count in counts.items() if count == n_episodes}
+    write_rows(path, [row for row in rows if _identify(row) in whole], EpisodeRow)
+    return whole
+
+
+def _evaluate_all(spec: BenchmarkSpec, jobs: Sequence[_Job], n_processes: int) -> Iterator[list[EpisodeRow]]:
+    """The rows of each job, in the jobs' order."""
+    commit = _commit()
+    if n_processes == 1:
+        yield from map(_Evaluator(spec, commit), jobs)
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(
+        n_processes, context, initializer=_start_worker, initargs=(spec, commit)
+    ) as pool:
+        yield from pool.map(_work, jobs)
+
+
+def _commit() -> str:
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short=10", "HEAD"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+
+
+class _Evaluator:
+    """Evaluates jobs one after the other, keeping the last policy and environment for the next one."""
+
+    def __init__(self, spec: BenchmarkSpec, commit: str) -> None:
+        self._spec = spec
+        self._commit = commit
+        self._load = lru_cache(maxsize=1)(self._load_policy)
+        self._make_env = lru_cache(maxsize=1)(self._make_vector_env)
+
+    def __call__(self, job: _Job) -> list[EpisodeRow]:
+        """The rows of a job's episodes."""
+        spec = self._spec
+        policy, preprocessor, postprocessor = self._load(job.checkpoint, job.variant)
+        env_config, env = self._make_env(job.task)
+        if isinstance(policy.config, GuidedConfig):
+            policy.config.guidance_scale = job.guidance.scale
+            if job.guidance.scale:
+                policy.config.guidance_integrator = job.guidance.integrator
+        env_preprocessor, env_postprocessor = make_env_pre_post_processors(env_config, policy.config)
+        latency = _measure_latency(env, policy, env_preprocessor, preprocessor, spec.episode_seed)
+        with _prior_noise(policy, job.repeat), redirect_stderr(io.StringIO()):  # LeRobot's own progress bars
+            outcomes = eval_policy(
+                env,
+                policy,
+                env_preprocessor,
+                env_postprocessor,
+                preprocessor,
+                postprocessor,
+                spec.n_episodes,
+                start_seed=spec.episode_seed,
+            )["per_episode"]
+        episodes = env.take_episodes(spec.n_episodes)
+        return [
+            EpisodeRow(
+                task=job.task,
+                policy=job.policy,
+                guidance_integrator=job.guidance.integrator,
+                guidance_scale=job.guidance.scale,
+                variant=job.variant,
+                seed=job.seed,
+                repeat=job.repeat,
+                episode=number,
+                success=bool(outcome["success"]),
+                collision=episode.collision,
+                min_clearance_m=_rounded(episode.min_clearance),
+                path_length_m=_rounded(episode.path_length),
+                steps=episode.steps,
+                chunk_latency_ms=latency,
+                checkpoint=job.checkpoint,
+                commit=self._commit,
+            )
+            for number, (outcome, episode) in enumerate(zip(outcomes, episodes, strict=True))
+        ]
+
+    def _load_policy(self, checkpoint: str, variant: str) -> tuple[Any, Any, Any]:
+        return load_policy(checkpoint, device=self._spec.device, **self._spec.variants[variant])
+
+    def _make_vector_env(self, task: str) -> tuple[EnvConfig, EpisodeRecorder]:
+        env_config = replace(self._spec.env, task=task)
+        n_envs = min(self._spec.batch_size, self._spec.n_episodes)
+        (env,) = next(iter(env_config.create_envs(n_envs, use_async_envs=False).values())).values()
+        return env_config, EpisodeRecorder(env)
+
+
+_worker: _Evaluator | None = None
+
+
+def _start_worker(spec: BenchmarkSpec, commit: str) -> None:
+    global _worker
+    torch.set_num_threads(1)
+    _worker = _Evaluator(spec, commit)
+
+
+def _work(job: _Job) -> list[EpisodeRow]:
+    assert _worker is not None  # set when the process started
+    return _worker(job)
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 6)
+
+
+@contextmanager
+def _prior_noise(policy: PreTrainedPolicy, repeat: int) -> Iterator[None]:
+    """Seeds the noise of every chunk by repeat, rollout and chunk: the same for all policies that draw as much of it."""
+    reset, predict = policy.reset, policy.predict_action_chunk
+    rollout, chunk = -1, 0
+
+    def seed() -> None:
+        (state,) = np.random.SeedSequence((repeat, rollout, chunk)).generate_state(1)
+        torch.manual_seed(int(state))
+
+    def seeded_reset() -> None:
+        nonlocal rollout, chunk
+        rollout, chunk = rollout + 1, 0
+        seed()
+        reset()
+
+    def seeded_predict(*args: Any, **kwargs: Any) -> Any:
+        nonlocal chunk
+        seed()
+        chunk += 1
+        return predict(*args, **kwargs)
+
+    policy.reset, policy.predict_action_chunk = seeded_reset, seeded_predict  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        del policy.reset, policy.predict_action_chunk
+
+
+def _measure_latency(
+    env: EpisodeRecorder,
+    policy: PreTrainedPolicy,
+    env_preprocessor: Any,
+    preprocessor: Any,
+    episode_seed: int,
+) -> float:
+    """Median time of a call that plans a new chunk for one robot [ms]."""
+    policy.eval()
+    observation, _ = env.reset(
+        seed=[episode_seed + i for i in range(env.num_envs)], options={NEW_ROLLOUT_OPTION: True}
+    )
+    observation = preprocess_observation({key: value[:1] for key, value in observation.items()})
+    observation = preprocessor(env_preprocessor({**observation, "task": [""]}))
+    times = []
+    for _ in range(_N_LATENCY_CALLS):
+        policy.reset()
+        _wait_for(policy)
+        began = time.perf_counter()
+        with torch.inference_mode():
+            policy.select_action(dict(observation))
+        _wait_for(policy)
+        times.append(time.perf_counter() - began)
+    return round(1000 * statistics.median(times[1:]), 3)  # the first one also warms up
+
+
+def _wait_for(policy: PreTrainedPolicy) -> None:
+    if next(policy.parameters()).is_cuda:
+        torch.cuda.synchronize()

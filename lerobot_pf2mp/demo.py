@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from lerobot_pf2mp.benchmark import Result, write_results
 from lerobot_pf2mp.dataset_tools.collect_maze import collect_maze
 from lerobot_pf2mp.dataset_tools.maze_dataset import maze_of
 from lerobot_pf2mp.envs import MAZE_TASKS
@@ -26,6 +25,7 @@ from lerobot_pf2mp.loading import load_policy
 from lerobot_pf2mp.plots import MazePath, plot_maze_overview
 from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
 from lerobot_pf2mp.rate import Rate
+from lerobot_pf2mp.results import NO_GUIDANCE, EpisodeRow, SummaryRow, summarise, write_rows
 
 _MODULES = {
     "pf2mp-train": "lerobot_pf2mp.train",
@@ -90,14 +90,14 @@ def run_demo(
     _say(2, f"Training: a small network, {steps} steps; the potential field is fitted on the way")
     _train(task, data, output_dir / "train", steps, seed)
 
-    results = []
+    episodes: list[EpisodeRow] = []
     for stage, (name, scale) in enumerate(
         (("FMP: guidance off", 0.0), ("PF2MP: the same weights with guidance", DEFAULT_GUIDANCE_SCALE)),
         start=3,
     ):
         _say(stage, f"Evaluation of {name}, {n_episodes} episodes")
         folder = output_dir / ("eval_pf2mp" if scale else "eval_fmp")
-        results.append(_evaluate(task, checkpoint, folder, n_episodes, seed, scale))
+        episodes += _evaluate(task, checkpoint, folder, n_episodes, seed, scale)
 
     _say(5, "Figure and table")
     figure = output_dir / "overview.png"
@@ -105,9 +105,10 @@ def run_demo(
         partial = figure.with_name("partial.png")
         _plot(checkpoint, maze, partial, seed)
         partial.rename(figure)
+    results = summarise(episodes)
     table = _table(results)
     (output_dir / "results.md").write_text(table, encoding="utf-8")
-    write_results(output_dir / "results.csv", results)
+    write_rows(output_dir / "results.csv", results, SummaryRow)
     print(f"\n{table}\nFigure: {figure}\nTable: {output_dir / 'results.md'}")
     print(f"Time: {(time.monotonic() - began) / 60:.1f} minutes")
 
@@ -168,7 +169,7 @@ def _train(task: str, data: Path, output_dir: Path, steps: int, seed: int) -> No
 
 def _evaluate(
     task: str, checkpoint: Path, output_dir: Path, n_episodes: int, seed: int, guidance_scale: float
-) -> Result:
+) -> list[EpisodeRow]:
     env_task = {maze: name for name, maze in MAZE_TASKS.items()}[maze_of(task, None)]
     if output_dir.exists():
         print("done already")
@@ -190,17 +191,29 @@ def _evaluate(
         )
         partial.rename(output_dir)
     metrics = json.loads((output_dir / "eval_info.json").read_text())["per_task"][0]["metrics"]
-    return Result(
-        task=env_task,
-        policy="fmp" if guidance_scale == 0 else "pf2mp",
-        guidance_integrator="" if guidance_scale == 0 else "proximal",
-        guidance_scale=guidance_scale,
-        seed=seed,
-        repeat=0,
-        n_episodes=n_episodes,
-        collisions=sum(reward < 0 for reward in metrics["sum_rewards"]),
-        successes=sum(metrics["successes"]),
-    )
+    return [
+        EpisodeRow(
+            task=env_task,
+            policy="pf2mp" if guidance_scale else "fmp",
+            guidance_integrator="proximal" if guidance_scale else NO_GUIDANCE,
+            guidance_scale=guidance_scale,
+            variant="",
+            seed=seed,
+            repeat=0,
+            episode=number,
+            success=success,
+            collision=reward < 0,
+            min_clearance_m=None,
+            path_length_m=None,
+            steps=None,
+            chunk_latency_ms=None,
+            checkpoint=str(checkpoint),
+            commit="",
+        )
+        for number, (success, reward) in enumerate(
+            zip(metrics["successes"], metrics["sum_rewards"], strict=True)
+        )
+    ]
 
 
 def _run(command: str, *options: str, equivalent: str | None = None, log: Path | None = None) -> None:
@@ -269,11 +282,11 @@ def _way(ball: SweptBall, start: np.ndarray, chunk: np.ndarray) -> MazePath:
     return MazePath(positions, np.array([ball.clearance(*pair) < 0 for pair in pairwise(positions)]))
 
 
-def _table(results: list[Result]) -> str:
+def _table(results: list[SummaryRow]) -> str:
     lines = ["| policy | collision rate | success rate | episodes |", "|---|---|---|---|"]
     for result in results:
         collision, success = (
-            Rate(count, result.n_episodes) for count in (result.collisions, result.successes)
+            Rate(count or 0, result.n_episodes) for count in (result.collisions, result.successes)
         )
         lines.append(f"| {result.policy} | {collision} | {success} | {result.n_episodes} |")
     return "\n".join(lines) + "\n"

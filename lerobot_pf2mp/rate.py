@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+
+from scipy.stats import binomtest
 
 
 @dataclass(frozen=True)
@@ -27,11 +28,8 @@ class Rate:
     @property
     def interval(self) -> tuple[float, float]:
         """The lower and upper end of the interval."""
-        z = 1.959964
-        share, n = self.value, self.total
-        centre = (share + z**2 / (2 * n)) / (1 + z**2 / n)
-        reach = z / (1 + z**2 / n) * math.sqrt(share * (1 - share) / n + z**2 / (4 * n**2))
-        return max(0.0, centre - reach), min(1.0, centre + reach)
+        ends = binomtest(self.count, self.total).proportion_ci(0.95, method="wilson")
+        return float(ends.low), float(ends.high)
 
     def __str__(self) -> str:
         low, high = self.interval

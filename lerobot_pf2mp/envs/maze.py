@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+from itertools import pairwise
 from typing import Any
 
 import gymnasium as gym
@@ -35,7 +37,8 @@ class MazeEnv(gym.Env):
 
     ## Information
     ``is_success``: the ball is within 0.45 m of the goal. ``is_collision``: it has touched a wall in this episode.
-    ``clearance``: the smallest distance to a wall on the way of this step [m], negative inside one.
+    ``clearance``: the smallest distance to a wall on the way of this step [m], negative inside one. ``path_length``: the
+    length of the way in this episode [m].
 
     ## Starting state
     PointMaze's: start and goal in different free cells, each up to 0.25 m off the centre on both axes. ``reset(options=
@@ -102,6 +105,7 @@ class MazeEnv(gym.Env):
         )
         self._path: list[np.ndarray] = []
         self._collisions: list[np.ndarray] = []
+        self._path_length = 0.0
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -121,6 +125,7 @@ class MazeEnv(gym.Env):
             self._maze.point_env.set_state(start, np.zeros(2))
         self._path = [self._position]
         self._collisions = []
+        self._path_length = 0.0
         clearance = self._swept_ball.clearance(self._position, self._position)
         return self._observation(), self._info(clearance)
 
@@ -142,6 +147,7 @@ class MazeEnv(gym.Env):
         if clearance < 0:
             self._collisions.append(way[-1])
         self._path.extend(way[1:])
+        self._path_length += sum(math.dist(*pair) for pair in pairwise(way))
         info = self._info(clearance)
         terminated = self._terminate_on_success and info["is_success"]
         return self._observation(), -1.0 if first_collision else 0.0, terminated, False, info
@@ -164,7 +170,7 @@ class MazeEnv(gym.Env):
 
     def _move_exactly(self, target: np.ndarray) -> list[np.ndarray]:
         start = self._position
-        self._maze.point_env.set_state(target, np.zeros(2))
+        self._maze.data.qpos[:2], self._maze.data.qvel[:2] = target, 0.0
         return [start, target]
 
     def _drive(self, target: np.ndarray) -> list[np.ndarray]:
@@ -197,7 +203,8 @@ class MazeEnv(gym.Env):
 
     def _info(self, clearance: float) -> dict[str, Any]:
         return {
-            "is_success": bool(np.linalg.norm(self._position - self._maze.goal) <= SUCCESS_RADIUS),
+            "is_success": math.dist(self._position, self._maze.goal) <= SUCCESS_RADIUS,
             "is_collision": bool(self._collisions),
             "clearance": clearance,
+            "path_length": self._path_length,
         }

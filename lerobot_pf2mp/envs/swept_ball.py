@@ -46,12 +46,9 @@ class SweptBall:
         self._walls = np.array(
             [i for i in range(self._model.ngeom) if self._model.geom(i).name.startswith("block_")]
         )
-        self._centres = self._model.geom_pos[self._walls, :2].copy()
-        self._half_sizes = self._model.geom_size[self._walls, :2].copy()
-        self._border = (
-            (self._centres - self._half_sizes).min(axis=0),
-            (self._centres + self._half_sizes).max(axis=0),
-        )
+        centres, half_sizes = self._model.geom_pos[self._walls, :2], self._model.geom_size[self._walls, :2]
+        self._low, self._high = centres - half_sizes, centres + half_sizes  # (walls, 2) corners
+        self._border = self._low.min(axis=0), self._high.max(axis=0)
         self._diagonal = float(np.linalg.norm(self._border[1] - self._border[0]))  # no wall is farther [m]
         self._height = float(
             self._model.geom_pos[self._walls[0], 2]
@@ -66,16 +63,17 @@ class SweptBall:
             end: ``(2,)`` position after [m]; positions beyond the map count as on its border.
         """
         start, end = np.clip(start, *self._border), np.clip(end, *self._border)
-        n_pieces = max(1, math.ceil(math.dist(start, end) / _LONGEST_PIECE))
-        return min(
-            self._clearance_of_piece(*piece) for piece in pairwise(np.linspace(start, end, n_pieces + 1))
-        )
+        n_pieces = math.ceil(math.dist(start, end) / _LONGEST_PIECE)
+        if n_pieces <= 1:
+            return self._clearance_of_piece(start, end)
+        cuts = np.linspace(start, end, n_pieces + 1)
+        return min(self._clearance_of_piece(*piece) for piece in pairwise(cuts))
 
     def _clearance_of_piece(self, start: np.ndarray, end: np.ndarray) -> float:
         low, high = np.minimum(start, end), np.maximum(start, end)
         # The gap between bounding boxes bounds the distance from below: measure the walls in that order.
-        gaps = np.maximum(self._centres - self._half_sizes - high, low - self._centres - self._half_sizes)
-        bounds = np.linalg.norm(gaps.clip(min=0), axis=1) - self._radius
+        gaps = np.maximum(np.maximum(self._low - high, low - self._high), 0.0)  # (walls, 2)
+        bounds = np.sqrt((gaps * gaps).sum(axis=1)) - self._radius
         self._place(start, end)
         smallest = self._diagonal
         for wall in np.argsort(bounds):
@@ -92,10 +90,9 @@ class SweptBall:
         if not ((path >= self._border[0]) & (path <= self._border[1])).all():
             return True  # the border is wall
         low, high = np.minimum(path[:-1], path[1:]), np.maximum(path[:-1], path[1:])  # (N - 1, 2)
-        gaps = np.maximum(
-            (self._centres - self._half_sizes)[:, None] - high,
-            low - (self._centres + self._half_sizes)[:, None],
-        ).max(axis=-1)  # (walls, N - 1), a lower bound of the distance to the centre's way
+        gaps = np.maximum(self._low[:, None] - high, low - self._high[:, None]).max(
+            axis=-1
+        )  # (walls, N - 1), a lower bound of the distance to the centre's way
         close = np.flatnonzero((gaps < self._radius).any(axis=0))
         return any(self.clearance(path[i], path[i + 1]) < 0 for i in close)
 

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Notes what a vectorised environment reports of every episode; LeRobot's evaluation keeps rewards and success only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What happened in one episode. Numbers that the environment does not report are None.
+
+    Args:
+        collision: Whether there was a collision (``is_collision`` in the environment's info).
+        min_clearance: Smallest ``clearance`` of all steps [m].
+        path_length: ``path_length`` at the end [m].
+        steps: Control steps.
+    """
+
+    collision: bool | None
+    min_clearance: float | None
+    path_length: float | None
+    steps: int
+
+
+class EpisodeRecorder(gym.vector.VectorWrapper):
+    """A vectorised environment that remembers its episodes.
+
+    Args:
+        env: The environment, whose sub-environments stay as they are once their episode has ended.
+    """
+
+    def __init__(self, env: gym.vector.VectorEnv) -> None:
+        super().__init__(env)
+        self._finished: list[Episode] = []
+        self._steps = np.zeros(env.num_envs, dtype=int)
+        self._ended = np.ones(env.num_envs, dtype=bool)
+        self._reported: list[dict[str, float]] = [{} for _ in range(env.num_envs)]
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or name == "env":
+            raise AttributeError(name)
+        return getattr(
+            self.env, name
+        )  # `call` and `envs`, which LeRobot uses, are not passed on by Gymnasium
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        """Starts the next episodes; those before are taken as finished."""
+        self._finish()
+        observation, info = self.env.reset(**kwargs)
+        self._steps[:] = 0
+        self._ended[:] = False
+        self._reported = [{} for _ in range(self.num_envs)]
+        self._note(info)
+        return observation, info
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Steps all sub-environments; those whose episode has ended are not recorded any more."""
+        observation, reward, terminated, truncated, info = self.env.step(actions)
+        self._steps += ~self._ended
+        self._note(info)
+        self._ended |= np.asarray(terminated) | np.asarray(truncated)
+        return observation, reward, terminated, truncated, info
+
+    def take_episodes(self, n_episodes: int) -> list[Episode]:
+        """The first episodes since the last call, in the order of the sub-environments of each rollout."""
+        self._finish()
+        episodes, self._finished = self._finished[:n_episodes], []
+        return episodes
+
+    def _note(self, info: dict[str, Any]) -> None:
+        for key in ("is_collision", "clearance", "path_length"):
+            values = info.get(key)
+            if values is None:
+                continue
+            is_given = info.get(f"_{key}", np.ones(self.num_envs, dtype=bool))
+            for i in np.flatnonzero(is_given & ~self._ended):
+                reported = self._reported[i]
+                value = float(values[i])
+                reported[key] = min(value, reported.get(key, value)) if key == "clearance" else value
+
+    def _finish(self) -> None:
+        if not self._steps.any():
+            return
+        for steps, reported in zip(self._steps.tolist(), self._reported, strict=True):
+            collision = reported.get("is_collision")
+            self._finished.append(
+                Episode(
+                    collision=None if collision is None else bool(collision),
+                    min_clearance=reported.get("clearance"),
+                    path_length=reported.get("path_length"),
+                    steps=steps,
+                )
+            )
+        self._steps[:] = 0
