@@ -18,14 +18,13 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager, redirect_stderr
+from contextlib import redirect_stderr
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from lerobot.envs import make_env_pre_post_processors
 from lerobot.envs.configs import EnvConfig
@@ -38,6 +37,7 @@ from lerobot_pf2mp.episode_recorder import EpisodeRecorder
 from lerobot_pf2mp.guidance import GUIDANCE_INTEGRATORS
 from lerobot_pf2mp.loading import load_config, load_policy
 from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
+from lerobot_pf2mp.prior_noise import seeded_prior_noise
 from lerobot_pf2mp.results import (
     NO_GUIDANCE,
     EpisodeRow,
@@ -322,7 +322,10 @@ class _Evaluator:
                 policy.config.guidance_integrator = job.guidance.integrator
         env_preprocessor, env_postprocessor = make_env_pre_post_processors(env_config, policy.config)
         latency = _measure_latency(env, policy, env_preprocessor, preprocessor, spec.episode_seed)
-        with _prior_noise(policy, job.repeat), redirect_stderr(io.StringIO()):  # LeRobot's own progress bars
+        with (
+            seeded_prior_noise(policy, job.repeat),
+            redirect_stderr(io.StringIO()),
+        ):  # LeRobot's own progress bars
             outcomes = eval_policy(
                 env,
                 policy,
@@ -382,35 +385,6 @@ def _work(job: _Job) -> list[EpisodeRow]:
 
 def _rounded(value: float | None) -> float | None:
     return None if value is None else round(value, 6)
-
-
-@contextmanager
-def _prior_noise(policy: PreTrainedPolicy, repeat: int) -> Iterator[None]:
-    """Seeds the noise of every chunk by repeat, rollout and chunk: the same for all policies that draw as much of it."""
-    reset, predict = policy.reset, policy.predict_action_chunk
-    rollout, chunk = -1, 0
-
-    def seed() -> None:
-        (state,) = np.random.SeedSequence((repeat, rollout, chunk)).generate_state(1)
-        torch.manual_seed(int(state))
-
-    def seeded_reset() -> None:
-        nonlocal rollout, chunk
-        rollout, chunk = rollout + 1, 0
-        seed()
-        reset()
-
-    def seeded_predict(*args: Any, **kwargs: Any) -> Any:
-        nonlocal chunk
-        seed()
-        chunk += 1
-        return predict(*args, **kwargs)
-
-    policy.reset, policy.predict_action_chunk = seeded_reset, seeded_predict  # type: ignore[method-assign]
-    try:
-        yield
-    finally:
-        del policy.reset, policy.predict_action_chunk
 
 
 def _measure_latency(

@@ -216,6 +216,45 @@ class BenchmarkConfig:
     output_dir: Path = Path("outputs/benchmark")
 
 
+@dataclass
+class PlotConfig:
+    """Draws a figure from benchmark results or from a checkpoint.
+
+    lambda: collision and success rate against lambda, from --results. density, arrows: the potential field of
+    --checkpoint. trajectories: episodes without and with guidance, from the same start and noise. overview: all of these
+    for a maze. flow: an animation (GIF) of chunks that move from noise to paths.
+
+    Examples:
+        pf2mp-plot --figure=lambda --results=[results/maze_lambda] --task=MazeLarge-v0 --output=lambda.png
+        pf2mp-plot --figure=density --checkpoint=outputs/maze_large/checkpoints/last/pretrained_model \
+--env.type=pf2mp_maze --env.task=MazeLarge-v0 --background=dark --output=density.png
+        pf2mp-plot --figure=flow --checkpoint=you/your_pf2mp --options='{num_inference_steps: 20}' --output=flow.gif
+    """
+
+    # lambda, density, arrows, trajectories, overview or flow.
+    figure: str = "overview"
+    # The file to write: PNG, or GIF for flow.
+    output: Path | None = None
+    # For lambda: folders written by pf2mp-benchmark, or their summary.csv.
+    results: list[Path] = field(default_factory=list)
+    # For lambda: which task, if the results are of several.
+    task: str | None = None
+    # For the others: the pretrained_model folder of a pf2mp or dppf policy, or its repository on the Hub.
+    checkpoint: str | None = None
+    # The environment.
+    env: EnvConfig = field(default_factory=PF2MPMazeEnv)
+    # Changes to the policy's options, for example {guidance_scale: 0.4}.
+    options: dict[str, Any] = field(default_factory=dict)
+    # Episodes to draw; by default those that show the difference best.
+    episodes: list[int] = field(default_factory=list)
+    # How many episodes to draw if none are named; for flow, how many chunks.
+    n_episodes: int = 6
+    # Seed of the first episode; episode i has this seed + i.
+    seed: int = 100000
+    # light or dark.
+    background: str = "light"
+
+
 def collect() -> None:
     """The command pf2mp-collect."""
     _run(CollectConfig, _collect)
@@ -239,6 +278,11 @@ def demo() -> None:
 def benchmark() -> None:
     """The command pf2mp-benchmark."""
     _run(BenchmarkConfig, _benchmark)
+
+
+def plot() -> None:
+    """The command pf2mp-plot."""
+    _run(PlotConfig, _plot)
 
 
 def train() -> None:
@@ -353,6 +397,36 @@ def _benchmark(config: BenchmarkConfig) -> None:
     )
     run_benchmark(spec, output_dir, n_processes=config.n_processes)
     print(f"{(output_dir / 'table.md').read_text(encoding='utf-8')}\nWrote {output_dir}.")
+
+
+def _plot(config: PlotConfig) -> None:
+    from lerobot_pf2mp import plots
+    from lerobot_pf2mp.figures import FIGURES, GuidedPolicyFigures, make_lambda_figure
+
+    for option, value, choices in (
+        ("--figure", config.figure, FIGURES),
+        ("--background", config.background, tuple(plots.THEMES)),
+    ):
+        if value not in choices:
+            raise ValueError(f"{option} must be one of {choices}, got {value!r}")
+    if config.n_episodes < 1 or any(episode < 0 for episode in config.episodes):
+        raise ValueError(
+            f"--n_episodes must be at least 1 and --episodes at least 0, got {config.n_episodes} and {config.episodes}"
+        )
+    output = _given("--output", config.output).expanduser()
+    wanted = ".gif" if config.figure == "flow" else ".png"
+    if output.suffix != wanted:
+        raise ValueError(f"--output must end in {wanted} for this figure, got {output}")
+    if config.figure == "lambda":
+        if not config.results:
+            raise ValueError("--results must name folders written by pf2mp-benchmark, got none")
+        results = [path.expanduser() for path in config.results]
+        make_lambda_figure(results, output, task=config.task, background=config.background)
+    else:
+        checkpoint = _given("--checkpoint", config.checkpoint)
+        figures = GuidedPolicyFigures(checkpoint, config.env, seed=config.seed, options=config.options)
+        figures.draw(config.figure, output, config.n_episodes, config.episodes, config.background)
+    print(f"Wrote {output}.")
 
 
 def _given[T](option: str, value: T | None) -> T:

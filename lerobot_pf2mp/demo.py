@@ -10,19 +10,12 @@ import subprocess
 import sys
 import time
 from contextlib import nullcontext
-from itertools import pairwise
 from pathlib import Path
-
-import numpy as np
-import torch
 
 from lerobot_pf2mp.dataset_tools.collect_maze import collect_maze
 from lerobot_pf2mp.dataset_tools.maze_dataset import maze_of
-from lerobot_pf2mp.envs import MAZE_TASKS
-from lerobot_pf2mp.envs.point_maze import BALL_RADIUS, make_point_maze
-from lerobot_pf2mp.envs.swept_ball import SweptBall
-from lerobot_pf2mp.loading import load_policy
-from lerobot_pf2mp.plots import MazePath, plot_maze_overview
+from lerobot_pf2mp.envs.configs import MAZE_TASKS, PF2MPMazeEnv
+from lerobot_pf2mp.figures import GuidedPolicyFigures
 from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
 from lerobot_pf2mp.rate import Rate
 from lerobot_pf2mp.results import NO_GUIDANCE, EpisodeRow, SummaryRow, summarise, write_rows
@@ -32,7 +25,6 @@ _MODULES = {
     "lerobot-eval": "lerobot.scripts.lerobot_eval",
 }
 DEFAULT_GUIDANCE_SCALE = PF2MPConfig.guidance_scale
-_N_FIGURE_EPISODES = 200
 
 
 def run_demo(
@@ -102,9 +94,8 @@ def run_demo(
     _say(5, "Figure and table")
     figure = output_dir / "overview.png"
     if not figure.exists():
-        partial = figure.with_name("partial.png")
-        _plot(checkpoint, maze, partial, seed)
-        partial.rename(figure)
+        figures = GuidedPolicyFigures(checkpoint, PF2MPMazeEnv(task=_env_task(task)), seed=seed)
+        figures.draw("overview", figure, 1, (), "light")
     results = summarise(episodes)
     table = _table(results)
     (output_dir / "results.md").write_text(table, encoding="utf-8")
@@ -167,10 +158,14 @@ def _train(task: str, data: Path, output_dir: Path, steps: int, seed: int) -> No
     )
 
 
+def _env_task(task: str) -> str:
+    return {maze: name for name, maze in MAZE_TASKS.items()}[maze_of(task, None)]
+
+
 def _evaluate(
     task: str, checkpoint: Path, output_dir: Path, n_episodes: int, seed: int, guidance_scale: float
 ) -> list[EpisodeRow]:
-    env_task = {maze: name for name, maze in MAZE_TASKS.items()}[maze_of(task, None)]
+    env_task = _env_task(task)
     if output_dir.exists():
         print("done already")
     else:
@@ -229,57 +224,6 @@ def _run(command: str, *options: str, equivalent: str | None = None, log: Path |
     if finished.returncode != 0:
         where = f"see {log}" if log else "its output is above"
         raise RuntimeError(f"{command} failed with exit code {finished.returncode}; {where}")
-
-
-def _plot(checkpoint: Path, maze: str, output: Path, seed: int) -> None:
-    """Draws Figure 3 for an episode in which FMP collides and PF2MP, from the same start and noise, does not."""
-    env, spec = make_point_maze(maze)
-    ball = SweptBall(spec, BALL_RADIUS)
-    policy, preprocess, postprocess = load_policy(checkpoint, device="cpu")
-    starts, goals = [], []
-    for episode in range(_N_FIGURE_EPISODES):
-        observation, _ = env.reset(seed=seed + episode)
-        starts.append(observation["achieved_goal"])
-        goals.append(observation["desired_goal"])
-    env.close()
-    batch = preprocess(
-        {
-            "observation.state": torch.tensor(np.array(starts), dtype=torch.float32),
-            "observation.environment_state": torch.tensor(np.array(goals), dtype=torch.float32),
-        }
-    )
-    noise = torch.randn(len(starts), policy.config.horizon, 2, generator=torch.Generator().manual_seed(seed))
-    guided = postprocess(policy.predict_action_chunk(batch, noise=noise)).numpy()
-    scale, policy.config.guidance_scale = policy.config.guidance_scale, 0.0
-    unguided = postprocess(policy.predict_action_chunk(batch, noise=noise)).numpy()
-    policy.config.guidance_scale = scale
-
-    ways = [
-        [_way(ball, start, chunk) for start, chunk in zip(starts, c, strict=True)] for c in (unguided, guided)
-    ]
-    # The longest way among those that show the difference; any way if there is none.
-    order = sorted(
-        range(len(starts)),
-        key=lambda i: (
-            bool(ways[0][i].collisions.any()) and not ways[1][i].collisions.any(),
-            np.linalg.norm(np.diff(ways[1][i].positions, axis=0), axis=1).sum(),
-        ),
-    )
-    best = order[-1]
-    plot_maze_overview(
-        output,
-        maze_map=env.maze.maze_map,
-        field=batch["potential_field"].field(policy.config.field_settings),
-        to_metres=postprocess,
-        unguided=ways[0][best],
-        guided=ways[1][best],
-        goal=goals[best],
-    )
-
-
-def _way(ball: SweptBall, start: np.ndarray, chunk: np.ndarray) -> MazePath:
-    positions = np.vstack([start, chunk])
-    return MazePath(positions, np.array([ball.clearance(*pair) < 0 for pair in pairwise(positions)]))
 
 
 def _table(results: list[SummaryRow]) -> str:

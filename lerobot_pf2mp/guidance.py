@@ -6,8 +6,10 @@ lambda Phi moves an action the fraction lambda dt / h^2 of the way to its local 
 printed; beyond a fraction of 1 it overshoots, the sensitivity to lambda that the paper reports. `proximal` solves the
 same equation exactly over the step and cannot overshoot for any lambda.
 
-They also differ in where they ask the field (`guidance_point`): `euler` at x_t, as printed; `proximal` after the
-generative step, when the noise which that step removes is gone. At x_t the guidance would remove it a second time.
+They also differ in where they ask the field (`guidance_point`). `euler` asks at x_t, as printed, where the action still
+carries the noise that the flow is about to remove, and removes it a second time. `proximal` asks at the end point that
+the step predicts, which is as clean as the network can tell; with many small steps even the point after the step is
+still mostly noise, and a strong guidance there takes the flow away from what the network knows.
 """
 
 from __future__ import annotations
@@ -54,7 +56,7 @@ class ProximalGuide:
 
     With the local mean m held fixed, dx/dt = lambda (m - x) / h^2 has the solution
     x = m + (x - m) exp(-lambda dt / h^2). The distance term pulls with constant strength lambda |alpha| and stops
-    where it arrives.
+    where it arrives. Both move the point at which the field is asked; the step is moved by as much.
 
     Args:
         field: The potential field.
@@ -64,7 +66,7 @@ class ProximalGuide:
 
     field: PotentialField
     scale: float
-    point: str = "next"
+    point: str = "end"
 
     def __call__(self, x_t: Tensor, x_next: Tensor, x_1: Tensor, dt: float) -> Tensor:
         """The guided step from the unguided one, all ``(..., D)`` [normalised]."""
@@ -95,7 +97,7 @@ def make_guide(
         integrator: One of `GUIDANCE_INTEGRATORS`.
         action_dims: Which of the last dimension's entries the field covers; the others pass unchanged. None: all.
         point: Where the field is evaluated, one of `GUIDANCE_POINTS`: at x_t, at the end point that the step predicts,
-            or after the step. None: the integrator's own, current for euler and next for proximal.
+            or after the step. None: the integrator's own, current for euler and end for proximal.
 
     Returns:
         The guide, or None.

@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
 from lerobot_pf2mp.flow_matching import Guide
@@ -54,12 +55,13 @@ class DPPFPolicy(DiffusionPolicy):
         """The next `n_action_steps` actions, ``(B, n_action_steps, action_dim)`` [normalised].
 
         Args:
-            batch: Normalised observations, as for `DiffusionPolicy.predict_action_chunk`, with the potential field.
+            batch: Normalised observations, as for `DiffusionPolicy.predict_action_chunk`, with the potential field. Without
+                past `select_action` calls, a single frame stands for the whole window.
             noise: ``(B, horizon, action_dim)`` the sample to denoise; drawn from N(0, I) if None.
             guide: Bends every denoising step, in place of the configured guidance; None for that.
         """
         with self._guided(guide or self.make_guide(batch)):
-            return super().predict_action_chunk(batch, noise=noise)
+            return super().predict_action_chunk(self._with_window(batch), noise=noise)
 
     def make_guide(self, batch: dict[str, Any]) -> Guide | None:
         """The configured guide over the field in the batch; None with ``guidance_scale=0``.
@@ -68,6 +70,17 @@ class DPPFPolicy(DiffusionPolicy):
             ValueError: If the batch holds no field, or one over other dimensions.
         """
         return self._guidance.make_guide(batch, next(self.parameters()).device)
+
+    def _with_window(self, batch: dict[str, Any]) -> dict[str, Any]:
+        if any(self._queues.values()):
+            return batch  # the window is in the queues
+        window = dict(batch)
+        n_dims = {OBS_STATE: 3, OBS_ENV_STATE: 3, **dict.fromkeys(self.config.image_features, 5)}
+        for key, wanted in n_dims.items():
+            if isinstance(batch.get(key), Tensor) and batch[key].ndim == wanted - 1:
+                frame = batch[key].unsqueeze(1)
+                window[key] = frame.expand(-1, self.config.n_obs_steps, *frame.shape[2:])
+        return window
 
     @contextmanager
     def _guided(self, guide: Guide | None) -> Iterator[None]:

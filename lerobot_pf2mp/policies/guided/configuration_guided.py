@@ -24,7 +24,7 @@ class GuidedConfig:
         guidance_scale: lambda, the strength of the guidance; 0 is exactly the unguided policy.
         guidance_integrator: proximal (solved exactly over a step, flat in lambda) or euler (Algorithm 2 as printed).
         guidance_point: Where the field is evaluated in each step: current (at A_t), end (at the end point that the step
-            predicts) or next (after the step). None is the integrator's own: current for euler, next for proximal.
+            predicts) or next (after the step). None is the integrator's own: current for euler, end for proximal.
         n_field_points: Demonstrated actions M kept as anchors of the field.
         field_action_dims: Action dimensions the field covers; None covers all. A gripper's opening is usually left out.
         field_bandwidth: Kernel bandwidth h [normalised action units], or how to choose it: likelihood (leave-one-out
