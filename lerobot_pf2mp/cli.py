@@ -9,13 +9,16 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import draccus
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_pf2mp.envs.configs import PF2MPMazeEnv
 from lerobot_pf2mp.errors import INTERRUPTED
+
+if TYPE_CHECKING:
+    from lerobot_pf2mp.benchmark import BenchmarkSpec
 
 
 @dataclass
@@ -379,10 +382,17 @@ def _demo(config: DemoConfig) -> None:
 
 
 def _benchmark(config: BenchmarkConfig) -> None:
-    from lerobot_pf2mp.benchmark import BenchmarkSpec, Guidance, run_benchmark
+    from lerobot_pf2mp.benchmark import run_benchmark
 
     output_dir = config.output_dir.expanduser()
-    spec = BenchmarkSpec(
+    run_benchmark(_benchmark_spec(config), output_dir, n_processes=config.n_processes)
+    print(f"{(output_dir / 'table.md').read_text(encoding='utf-8')}\nWrote {output_dir}.")
+
+
+def _benchmark_spec(config: BenchmarkConfig) -> BenchmarkSpec:
+    from lerobot_pf2mp.benchmark import BenchmarkSpec, Guidance
+
+    return BenchmarkSpec(
         env=config.env,
         tasks=tuple(config.tasks or [str(config.env.task)]),
         policies=config.policies,
@@ -395,8 +405,6 @@ def _benchmark(config: BenchmarkConfig) -> None:
         batch_size=config.batch_size,
         device=config.device,
     )
-    run_benchmark(spec, output_dir, n_processes=config.n_processes)
-    print(f"{(output_dir / 'table.md').read_text(encoding='utf-8')}\nWrote {output_dir}.")
 
 
 def _plot(config: PlotConfig) -> None:

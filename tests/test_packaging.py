@@ -9,8 +9,13 @@ import venv
 import zipfile
 from pathlib import Path
 
+import draccus
 import pytest
 import yaml
+from lerobot.configs.train import TrainPipelineConfig
+
+from lerobot_pf2mp import DPPFConfig, PF2MPConfig, PF2MPMazeEnv
+from lerobot_pf2mp.cli import BenchmarkConfig, _benchmark_spec
 
 ROOT = Path(__file__).parents[1]
 
@@ -23,7 +28,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 import lerobot_pf2mp, gymnasium
 assert "site-packages" in lerobot_pf2mp.__file__ and sys.argv[1] in lerobot_pf2mp.__file__, lerobot_pf2mp.__file__
-for name in ("fmp", "pf2mp"):
+for name in ("fmp", "pf2mp", "dppf"):
     assert get_policy_class(name).name == name
     config = PreTrainedConfig.get_choice_class(name)(device="cpu")
     make_pre_post_processors(config)
@@ -47,21 +52,22 @@ def test_constraints_hold_names_and_versions_only() -> None:
         assert not set(line) & set("/:@ "), line
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "eval_configs").glob("*.yaml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", sorted((ROOT / "eval_configs").rglob("*.yaml")), ids=lambda path: path.stem)
 def test_configuration_files_are_valid(path: Path) -> None:
-    import draccus
-    from lerobot.configs.train import TrainPipelineConfig
-
-    from lerobot_pf2mp import PF2MPConfig, PF2MPMazeEnv
-
     content = yaml.safe_load(path.read_text())
+    assert f"--config_path={path.relative_to(ROOT)}" in path.read_text()  # the comment says how to use it
     if path.stem.startswith("train_"):
         config = draccus.parse(TrainPipelineConfig, path, args=[])
         assert config.policy.horizon == 80
+    elif "policies" in content:
+        spec = _benchmark_spec(draccus.parse(BenchmarkConfig, path, args=[]))
+        for changes in spec.variants.values():
+            PF2MPConfig(device="cpu", **changes)
+            DPPFConfig(device="cpu", **changes)
     else:
         assert PF2MPMazeEnv(task=content["env"]["task"]).type == content["env"]["type"]
         overrides = {key: value for key, value in content["policy"].items() if key != "path"}
-        PF2MPConfig(device="cpu", **overrides)
+        (DPPFConfig if "dppf" in path.stem else PF2MPConfig)(device="cpu", **overrides)
 
 
 @pytest.mark.slow
