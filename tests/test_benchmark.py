@@ -1,135 +1,804 @@
 # SPDX-License-Identifier: Apache-2.0
-import csv
+import json
+import math
+import re
+import shutil
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
-from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.policies import make_pre_post_processors
+from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
+from lerobot.policies.factory import get_policy_class
+from torch import Tensor
 
-from lerobot_pf2mp import FMPConfig, PF2MPConfig, PF2MPMazeEnv, load_policy
-from lerobot_pf2mp.benchmark import Guidance, Result, make_table, run_benchmark, write_results
+from lerobot_pf2mp import DPPFConfig, FMPConfig, PF2MPConfig, PF2MPMazeEnv, benchmark, load_policy
+from lerobot_pf2mp.benchmark import NONE, BenchmarkSpec, Guidance, run_benchmark
+from lerobot_pf2mp.envs.maze import MazeEnv
+from lerobot_pf2mp.errors import ConfigError
+from lerobot_pf2mp.policies.dppf.modeling_dppf import DPPFPolicy
+from lerobot_pf2mp.policies.fmp import modeling_fmp
 from lerobot_pf2mp.policies.pf2mp.modeling_pf2mp import PF2MPPolicy
-from lerobot_pf2mp.policies.pf2mp.processor_pf2mp import make_pf2mp_pre_post_processors
-from lerobot_pf2mp.rate import Rate
+from lerobot_pf2mp.potential_field_processor import PotentialFieldProcessorStep
+from lerobot_pf2mp.results import EpisodeRow, SummaryRow, read_rows
 
-RESULT = Result("MazeLarge-v0", "pf2mp", "proximal", 0.8, 0, 0, n_episodes=50, collisions=1, successes=49)
+STATE, ENV, ACTION = "observation.state", "observation.environment_state", "action"
+UMAZE = "MazeUMaze-v0"
+HALF_WIDTH = 1.5  # of what the untrained policies' actions and observations are normalised to [m]
+EPISODE_LENGTH, N_EPISODES, EPISODE_SEED = 6, 3, 7
+COLUMNS = (
+    "task,policy,guidance_integrator,guidance_scale,variant,seed,repeat,episode,success,collision,min_clearance_m,"
+    "path_length_m,steps,chunk_latency_ms,checkpoint,commit"
+)
+FEATURES: dict[str, Any] = {
+    "device": "cpu",
+    "n_action_steps": 4,
+    "input_features": {
+        STATE: PolicyFeature(FeatureType.STATE, (2,)),
+        ENV: PolicyFeature(FeatureType.ENV, (2,)),
+    },
+    "output_features": {ACTION: PolicyFeature(FeatureType.ACTION, (2,))},
+}
+U_NET: dict[str, Any] = {
+    **FEATURES,
+    "horizon": 8,
+    "down_dims": (8, 16),
+    "diffusion_step_embed_dim": 16,
+    "num_inference_steps": 2,
+}
+DENOISING: dict[str, Any] = {**U_NET, "noise_scheduler_type": "DDIM", "num_train_timesteps": 20}
+TRANSFORMER: dict[str, Any] = {
+    **FEATURES,
+    "chunk_size": 8,
+    "dim_model": 16,
+    "dim_feedforward": 16,
+    "n_heads": 2,
+    "n_encoder_layers": 1,
+    "use_vae": False,
+    "pretrained_backbone_weights": None,
+}
+MAKE_CONFIG: dict[str, Callable[[], PreTrainedConfig]] = {
+    "fmp": lambda: FMPConfig(**U_NET),
+    "pf2mp": lambda: PF2MPConfig(**U_NET),
+    "diffusion": lambda: DiffusionConfig(**DENOISING),
+    "dppf": lambda: DPPFConfig(**DENOISING),
+    "act": lambda: ACTConfig(**TRANSFORMER),
+}
+
+
+def write_checkpoint(folder: Path, kind: str, seed: int = 0) -> str:
+    """An untrained policy: its weights are those of its seed, its field covers the middle of the maze."""
+    torch.manual_seed(seed)
+    config = MAKE_CONFIG[kind]()
+    ends = {
+        "min": torch.full((2,), -HALF_WIDTH),
+        "max": torch.full((2,), HALF_WIDTH),
+        "mean": torch.zeros(2),
+        "std": torch.ones(2),
+    }
+    policy = get_policy_class(kind)(config)
+    preprocessor, postprocessor = make_pre_post_processors(
+        config, dataset_stats=dict.fromkeys((STATE, ENV, ACTION), ends)
+    )
+    for step in preprocessor.steps:
+        if isinstance(step, PotentialFieldProcessorStep):
+            step.demonstrations.observe(
+                0.3 * torch.randn(4, 8, 2), None, None, settings=config.field_settings
+            )
+    for part in (policy, preprocessor, postprocessor):
+        part.save_pretrained(folder)
+    return str(folder)
 
 
 @pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An untrained policy whose field covers the middle of the maze."""
-    folder = tmp_path_factory.mktemp("checkpoint")
-    torch.manual_seed(0)
-    config = PF2MPConfig(
-        device="cpu",
-        horizon=8,
-        n_action_steps=8,
-        down_dims=(8, 16),
-        diffusion_step_embed_dim=16,
-        input_features={
-            "observation.state": PolicyFeature(FeatureType.STATE, (2,)),
-            "observation.environment_state": PolicyFeature(FeatureType.ENV, (2,)),
-        },
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (2,))},
-    )
-    ends = {"min": torch.tensor([-1.5, -1.5]), "max": torch.tensor([1.5, 1.5])}
-    stats = dict.fromkeys(("observation.state", "observation.environment_state", "action"), ends)
-    policy = PF2MPPolicy(config, dataset_stats=stats)
-    preprocessor, postprocessor = make_pf2mp_pre_post_processors(config, stats)
-    batch = {
-        "observation.state": torch.rand(4, 2),
-        "observation.environment_state": torch.rand(4, 2),
-        "action": 0.3 * torch.randn(4, 8, 2),
+def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """One checkpoint of each kind of policy."""
+    folder = tmp_path_factory.mktemp("checkpoints")
+    return {kind: write_checkpoint(folder / kind, kind) for kind in MAKE_CONFIG}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _mazes_are_made_once() -> Iterator[None]:
+    """A maze takes half a second to make; here all benchmarks with the same options share theirs."""
+    create_envs, made = PF2MPMazeEnv.create_envs, {}
+
+    def create_once(self: PF2MPMazeEnv, n_envs: int, use_async_envs: bool = False) -> Any:
+        key = repr(self), n_envs
+        if key not in made:
+            made[key] = create_envs(self, n_envs, use_async_envs)
+        return made[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PF2MPMazeEnv, "create_envs", create_once)
+        yield
+
+
+def spec_of(policies: dict[str, str], *guidances: str, **options: Any) -> BenchmarkSpec:
+    defaults: dict[str, Any] = {
+        "env": PF2MPMazeEnv(task=UMAZE, episode_length=EPISODE_LENGTH),
+        "tasks": (UMAZE,),
+        "guidances": tuple(guidance for text in guidances or ("none",) for guidance in Guidance.parse(text)),
+        "variants": {"": {}},
+        "n_repeats": 1,
+        "n_episodes": N_EPISODES,
+        "episode_seed": EPISODE_SEED,
+        "batch_size": 2,  # the last rollout has an episode too many
     }
-    policy.train()
-    policy(preprocessor(batch))
-    for part in (policy, preprocessor, postprocessor):
-        part.save_pretrained(folder)
+    return BenchmarkSpec(policies=policies, **{**defaults, **options})
+
+
+def rows_of(folder: Path) -> list[EpisodeRow]:
+    return read_rows(folder / "episodes.csv", EpisodeRow)
+
+
+def timeless(rows: list[EpisodeRow]) -> list[EpisodeRow]:
+    """Everything but the time, which no two runs share."""
+    return [replace(row, chunk_latency_ms=None) for row in rows]
+
+
+def run(spec: BenchmarkSpec, folder: Path) -> list[EpisodeRow]:
+    run_benchmark(spec, folder)
+    return timeless(rows_of(folder))
+
+
+def outcomes(rows: list[EpisodeRow], policy: str, **where: Any) -> list[tuple]:
+    """What happened in a policy's episodes."""
+    return [
+        (
+            row.task,
+            row.seed,
+            row.repeat,
+            row.episode,
+            row.success,
+            row.collision,
+            row.min_clearance_m,
+            row.path_length_m,
+        )
+        for row in rows
+        if row.policy == policy and all(getattr(row, name) == value for name, value in where.items())
+    ]
+
+
+@pytest.fixture(scope="module")
+def whole_spec(checkpoints: dict[str, str]) -> BenchmarkSpec:
+    """Three kinds of guidance in two repeats each."""
+    return spec_of({"pf2mp": checkpoints["pf2mp"]}, "none", "euler:0.01", "proximal:0.8", n_repeats=2)
+
+
+@pytest.fixture(scope="module")
+def whole(
+    whole_spec: BenchmarkSpec, tmp_path_factory: pytest.TempPathFactory, _mazes_are_made_once: None
+) -> Path:
+    """The folder of `whole_spec`, run without interruption."""
+    folder = tmp_path_factory.mktemp("whole") / "benchmark"
+    run_benchmark(whole_spec, folder)
     return folder
 
 
-def test_the_wilson_interval_has_its_published_values() -> None:
-    assert Rate(5, 10).interval == pytest.approx((0.2366, 0.7634), abs=1e-4)
-    assert Rate(0, 10).interval == pytest.approx((0.0, 0.2775), abs=1e-4)
-    assert Rate(10, 10).interval == pytest.approx((0.7225, 1.0), abs=1e-4)
-    assert str(Rate(1, 4)) == "25.0 % [4.6, 69.9]"
+@pytest.fixture
+def copied(whole: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(whole, tmp_path / "benchmark")
+
+
+@pytest.fixture
+def evaluations(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The guidance scales of the evaluations that really run."""
+    scales: list[float] = []
+    eval_policy = benchmark.eval_policy
+
+    def counted(env: Any, policy: Any, *arguments: Any, **options: Any) -> Any:
+        scales.append(getattr(policy.config, "guidance_scale", 0.0))
+        return eval_policy(env, policy, *arguments, **options)
+
+    monkeypatch.setattr(benchmark, "eval_policy", counted)
+    return scales
+
+
+# What to compare
 
 
 def test_guidance_is_read_from_text() -> None:
-    assert Guidance.parse("fmp").scale == 0
-    assert Guidance.parse("euler:0.0001") == Guidance("euler", 0.0001)
-    for text in ("off", "proximal", "proximal:", "proximal:-1", "proximal:0", "proximal:nan", "rk4:1"):
-        with pytest.raises(ValueError, match=f"got '{text}'"):
-            Guidance.parse(text)
+    assert Guidance.parse("none") == [NONE]
+    assert Guidance("none", 0.0) == NONE
+    assert Guidance.parse("euler:0.0001") == [Guidance("euler", 0.0001)]
+    assert Guidance.parse("proximal:0.08,0.8,8") == [Guidance("proximal", scale) for scale in (0.08, 0.8, 8)]
 
 
-def test_all_kinds_of_guidance_see_the_same_episodes_and_every_repeat_other_noise(checkpoint: Path) -> None:
-    env = PF2MPMazeEnv(task="MazeUMaze-v0", episode_length=8)
-    guidances = [Guidance.parse("fmp"), Guidance.parse("proximal:0.8"), Guidance.parse("fmp")]
-    options = {"n_episodes": 6, "n_repeats": 2, "seed": 7, "batch_size": 3}
-    results = run_benchmark(checkpoint, env, guidances, **options)
-    assert [(r.policy, r.repeat, r.n_episodes) for r in results] == [
-        (policy, repeat, 6) for policy in ("fmp", "pf2mp", "fmp") for repeat in (0, 1)
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "off",
+        "fmp",
+        "None",
+        "none:1",
+        "proximal",
+        "proximal:",
+        "proximal:weak",
+        "proximal:0.8,",
+        "proximal:0.8;8",
     ]
-    assert results[:2] == results[4:]  # the same pairs and noise, whatever ran in between
-    assert run_benchmark(checkpoint, env, guidances, **options) == results
+    + [f"proximal:{scale}" for scale in ("0", "-1", "nan", "inf", "0.8,0")]
+    + ["rk4:1", ":1", "Euler:1"],
+)
+def test_text_that_is_no_guidance_is_refused_with_the_rule(text: str) -> None:
+    rule = "guidance must be none or INTEGRATOR:SCALE,SCALE,... with an integrator of ('euler', 'proximal') and positive"
+    with pytest.raises(ValueError, match=f"{re.escape(rule)} scales, got '{re.escape(text)}'"):
+        Guidance.parse(text)
 
 
-def test_every_kind_of_guidance_is_the_one_that_acts(
-    checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("name", ["n_repeats", "n_episodes", "batch_size"])
+def test_numbers_below_one_are_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=f"{name} must be at least 1, got 0"):
+        spec_of({"pf2mp": "somewhere"}, **{name: 0})
+
+
+@pytest.mark.parametrize(
+    ("name", "empty"), [("tasks", ()), ("policies", {}), ("guidances", ()), ("variants", {}), ("seeds", ())]
+)
+def test_nothing_to_compare_is_refused(name: str, empty: Any) -> None:
+    with pytest.raises(ValueError, match=f"{name} must name at least one, got none"):
+        replace(spec_of({"pf2mp": "somewhere"}), **{name: empty})
+
+
+def test_less_than_one_process_is_refused(checkpoints: dict[str, str], tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="n_processes must be at least 1, got 0"):
+        run_benchmark(spec_of(checkpoints), tmp_path / "benchmark", n_processes=0)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_checkpoint_that_does_not_exist_is_an_error_before_anything_is_written(
+    checkpoints: dict[str, str], tmp_path: Path
 ) -> None:
-    acted = []
-    make_guide = PF2MPPolicy.make_guide
+    spec = spec_of({"pf2mp": checkpoints["pf2mp"], "other": "/no/where/{task}_{seed}"}, seeds=(3,))
+    with pytest.raises(FileNotFoundError, match=f"pretrained_model folder .* got /no/where/{UMAZE}_3"):
+        run_benchmark(spec, tmp_path / "benchmark")
+    assert not list(tmp_path.iterdir())
 
-    def recorded(self: PF2MPPolicy, batch: dict) -> object:
+
+def test_two_policies_whose_rows_have_one_name_are_an_error_before_anything_is_written(
+    checkpoints: dict[str, str], tmp_path: Path
+) -> None:
+    both = {name: checkpoints[name] for name in ("pf2mp", "fmp")}
+    with pytest.raises(
+        ValueError, match=r"every policy must have a name of its own, got 'fmp' twice \(guidance none\)"
+    ):
+        run_benchmark(spec_of(both, "none"), tmp_path / "benchmark")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_task_that_does_not_exist_is_an_error_before_anything_is_written(
+    checkpoints: dict[str, str], tmp_path: Path
+) -> None:
+    spec = spec_of({"pf2mp": checkpoints["pf2mp"]}, tasks=(UMAZE, "MazeHuge-v0"))
+    with pytest.raises(ConfigError, match="task must be one of .* got 'MazeHuge-v0'"):
+        run_benchmark(spec, tmp_path / "benchmark")
+    assert not list(tmp_path.iterdir())
+
+
+# Rows
+
+
+def test_every_episode_is_one_row(whole: Path, whole_spec: BenchmarkSpec) -> None:
+    assert (whole / "episodes.csv").read_text().splitlines()[0] == COLUMNS
+    rows = rows_of(whole)
+    assert [
+        (row.policy, row.guidance_integrator, row.guidance_scale, row.repeat, row.episode) for row in rows
+    ] == [
+        (*policy, repeat, episode)
+        for policy in (("fmp", "none", 0.0), ("pf2mp", "euler", 0.01), ("pf2mp", "proximal", 0.8))
+        for repeat in (0, 1)
+        for episode in range(N_EPISODES)
+    ]
+    for row in rows:
+        assert (row.task, row.variant, row.seed) == (UMAZE, "", 0)
+        assert row.steps == EPISODE_LENGTH
+        assert row.collision == (row.min_clearance_m < 0)
+        assert row.path_length_m > 0
+        assert row.checkpoint == whole_spec.policies["pf2mp"]
+        assert re.fullmatch("([0-9a-f]{10})?", row.commit)
+    for start in range(0, len(rows), N_EPISODES):
+        (latency,) = {row.chunk_latency_ms for row in rows[start : start + N_EPISODES]}
+        assert latency > 0
+
+
+def test_a_benchmark_leaves_rows_summary_tables_and_what_it_was_made_with(
+    whole: Path, whole_spec: BenchmarkSpec, copied: Path
+) -> None:
+    assert {path.name for path in whole.iterdir()} == {
+        "episodes.csv",
+        "summary.csv",
+        "table.md",
+        "table.tex",
+        "run.json",
+    }
+    assert run_benchmark(whole_spec, copied) == read_rows(whole / "summary.csv", SummaryRow)
+    assert [line.split("|")[2].strip() for line in (whole / "table.md").read_text().splitlines()[2:]] == [
+        "fmp",
+        "pf2mp",
+        "pf2mp",
+    ]
+    assert (whole / "table.tex").read_text().count(r"\\") == 1 + 3
+    run_json = json.loads((whole / "run.json").read_text())
+    assert run_json["episodes"]["env"]["episode_length"] == EPISODE_LENGTH
+    assert run_json["episodes"]["episode_seed"] == EPISODE_SEED
+    assert run_json["variants"] == {"": {}}
+    assert run_json["made_with"]["lerobot"].startswith("0.6.")
+    assert run_json["made_with"].keys() == {
+        *("lerobot", "torch", "mujoco", "gymnasium-robotics", "diffusers", "python", "machine")
+    }
+
+
+def test_a_guided_policy_has_another_name_without_guidance_and_others_are_evaluated_once(
+    checkpoints: dict[str, str], tmp_path: Path
+) -> None:
+    policies = {
+        "pf2mp": checkpoints["pf2mp"],
+        "dppf": checkpoints["dppf"],
+        "mine": checkpoints["pf2mp"],
+        "flow": checkpoints["fmp"],
+        "diffusion": checkpoints["diffusion"],
+        "act": checkpoints["act"],
+    }
+    spec = spec_of(policies, "none", "proximal:0.8", n_repeats=2, n_episodes=2)
+    assert Counter(
+        (row.policy, row.guidance_integrator, row.guidance_scale, row.checkpoint)
+        for row in run(spec, tmp_path)
+    ) == {
+        (name, *guidance, checkpoints[kind]): 2 * 2
+        for name, guidance, kind in (
+            ("fmp", ("none", 0.0), "pf2mp"),
+            ("pf2mp", ("proximal", 0.8), "pf2mp"),
+            ("dp", ("none", 0.0), "dppf"),
+            ("dppf", ("proximal", 0.8), "dppf"),
+            ("mine unguided", ("none", 0.0), "pf2mp"),
+            ("mine", ("proximal", 0.8), "pf2mp"),
+            ("flow", ("none", 0.0), "fmp"),
+            ("diffusion", ("none", 0.0), "diffusion"),
+            ("act", ("none", 0.0), "act"),
+        )
+    }
+
+
+def test_policies_without_guidance_are_evaluated_whatever_guidance_is_asked_for(
+    checkpoints: dict[str, str], tmp_path: Path
+) -> None:
+    rows = run(
+        spec_of({name: checkpoints[name] for name in ("act", "pf2mp")}, "proximal:0.8", "proximal:8"),
+        tmp_path,
+    )
+    assert Counter((row.policy, row.guidance_scale) for row in rows) == {
+        ("act", 0.0): N_EPISODES,
+        ("pf2mp", 0.8): N_EPISODES,
+        ("pf2mp", 8.0): N_EPISODES,
+    }
+
+
+def test_names_may_hold_commas_and_quotes(checkpoints: dict[str, str], tmp_path: Path) -> None:
+    name, variant = 'mine, the "new" one', "N=1, few"
+    spec = spec_of({name: checkpoints["fmp"]}, variants={variant: {"num_inference_steps": 1}})
+    rows = run(spec, tmp_path)
+    assert [(row.policy, row.variant, row.episode) for row in rows] == [
+        (name, variant, i) for i in range(N_EPISODES)
+    ]
+    assert run(spec, tmp_path) == rows
+
+
+def test_task_and_seed_in_a_path_stand_for_the_task_and_the_training_seed(
+    checkpoints: dict[str, str], tmp_path: Path
+) -> None:
+    tasks, seeds = (UMAZE, "MazeMedium-v0"), (3, 11)
+    for task in tasks:
+        for seed in seeds:
+            write_checkpoint(tmp_path / task / f"seed_{seed}", "fmp", seed)
+    spec = spec_of({"flow": f"{tmp_path}/{{task}}/seed_{{seed}}"}, tasks=tasks, seeds=seeds, n_episodes=2)
+    rows = run(spec, tmp_path / "benchmark")
+    assert [(row.task, row.seed, row.checkpoint) for row in rows] == [
+        (task, seed, f"{tmp_path}/{task}/seed_{seed}") for task in tasks for seed in seeds for _ in range(2)
+    ]
+    # All four differ in maze or weights, and so in the ways they take.
+    assert len({row.path_length_m for row in rows}) == len(rows)
+
+
+def test_variants_change_the_configuration_of_the_policy(
+    checkpoints: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loaded = []
+    load = benchmark.load_policy
+
+    def recorded(*arguments: Any, **options: Any) -> Any:
+        policy, *processors = load(*arguments, **options)
+        config = policy.config
+        loaded.append((config.num_inference_steps, config.n_field_points, config.field_bandwidth))
+        return policy, *processors
+
+    monkeypatch.setattr(benchmark, "load_policy", recorded)
+    variants = {
+        "": {},
+        "one step": {"num_inference_steps": 1},
+        "few": {"n_field_points": 5, "field_bandwidth": 0.25},
+    }
+    rows = run(spec_of({"pf2mp": checkpoints["pf2mp"]}, "none", "proximal:0.8", variants=variants), tmp_path)
+    assert loaded == [(2, 3000, "likelihood"), (1, 3000, "likelihood"), (2, 5, 0.25)]
+
+    unguided = [outcomes(rows, "fmp", variant=variant) for variant in variants]
+    guided = [outcomes(rows, "pf2mp", variant=variant) for variant in variants]
+    assert unguided[0] == unguided[2]  # without guidance the field does nothing
+    paths = [episode[-1] for episodes in (*unguided[:2], *guided) for episode in episodes]
+    assert len(set(paths)) == len(paths) == 5 * N_EPISODES
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"use_ema": False},
+        {"guidance_point": None},
+        {"guidance_point": "current"},
+        {"field_bandwidth": 0.1},
+        {"field_bandwidth": "scott"},
+        {"field_action_dims": (0, 1)},
+    ],
+    ids=str,
+)
+def test_options_of_every_type_can_be_changed(checkpoints: dict[str, str], options: dict[str, Any]) -> None:
+    policy, _, _ = load_policy(checkpoints["pf2mp"], device="cpu", **options)
+    assert {name: getattr(policy.config, name) for name in options} == options
+
+
+@pytest.mark.parametrize(("kind", "policy_class"), [("pf2mp", PF2MPPolicy), ("dppf", DPPFPolicy)])
+def test_every_kind_of_guidance_is_the_one_that_acts(
+    checkpoints: dict[str, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    kind: str,
+    policy_class: type,
+) -> None:
+    acted: list[tuple[str, float]] = []
+    make_guide = policy_class.make_guide
+
+    def recorded(self: Any, batch: dict) -> Any:
         guide = make_guide(self, batch)
-        acted.append((type(guide).__name__, getattr(guide, "scale", 0.0)))
+        kind_of_guide = type(guide).__name__, getattr(guide, "scale", 0.0)
+        if kind_of_guide not in acted[-1:]:
+            acted.append(kind_of_guide)
         return guide
 
-    monkeypatch.setattr(PF2MPPolicy, "make_guide", recorded)
-    guidances = [Guidance.parse(text) for text in ("fmp", "euler:0.01", "proximal:0.8")]
-    env = PF2MPMazeEnv(task="MazeUMaze-v0", episode_length=2)
-    run_benchmark(checkpoint, env, guidances, n_episodes=2, n_repeats=1, seed=0)
-    assert acted == [("NoneType", 0.0), ("EulerGuide", 0.01), ("ProximalGuide", 0.8)]
+    monkeypatch.setattr(policy_class, "make_guide", recorded)
+    guidances = ("euler:0.01", "none", "proximal:0.8,0.08", "euler:0.02")
+    run(spec_of({kind: checkpoints[kind]}, *guidances), tmp_path)
+    assert acted == [
+        ("EulerGuide", 0.01),
+        ("NoneType", 0.0),
+        ("ProximalGuide", 0.8),
+        ("ProximalGuide", 0.08),
+        ("EulerGuide", 0.02),
+    ]
 
 
-def test_collisions_and_successes_are_counted(checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_collisions_and_successes_are_counted(
+    checkpoints: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     # A policy that goes straight to the goal: in a free room it arrives, through the middle wall of a U it collides.
-    def to_the_goal(self: PF2MPPolicy, batch: dict, **_: object) -> torch.Tensor:
-        return batch["observation.environment_state"]
+    target = ENV
 
-    monkeypatch.setattr(PF2MPPolicy, "select_action", to_the_goal)
-    options = {"n_episodes": 20, "n_repeats": 1, "seed": 0, "batch_size": 10}
-    room = PF2MPMazeEnv(task="MazeUMaze-v0", episode_length=2, maze_map="11111/10001/10001/11111")
-    (free,) = run_benchmark(checkpoint, room, [Guidance.parse("fmp")], **options)
-    assert (free.collisions, free.successes) == (0, 20)
-    (blocked,) = run_benchmark(
-        checkpoint, PF2MPMazeEnv(task="MazeUMaze-v0", episode_length=2), [Guidance.parse("fmp")], **options
+    def straight(self: PF2MPPolicy, batch: dict, **_: object) -> Tensor:
+        return batch[target]
+
+    monkeypatch.setattr(PF2MPPolicy, "select_action", straight)
+    policies, options = {"pf2mp": checkpoints["pf2mp"]}, {"n_episodes": 12, "batch_size": 4}
+    env = PF2MPMazeEnv(task=UMAZE, episode_length=2, maze_map="11111/10001/10001/11111")
+    room = run(spec_of(policies, env=env, **options), tmp_path / "room")
+    assert [(row.collision, row.success, row.steps) for row in room] == [(False, True, 2)] * 12
+    maze = MazeEnv(env.maze_map)
+    for row in room:
+        observation, _ = maze.reset(seed=EPISODE_SEED + row.episode)
+        way = observation["environment_state"] - observation["agent_pos"]
+        assert row.path_length_m == pytest.approx(math.hypot(*way), abs=1e-5)
+        assert 0 < row.min_clearance_m < 0.75
+
+    u = run(spec_of(policies, env=replace(env, maze_map=None), **options), tmp_path / "u")
+    assert all(row.success for row in u)
+    assert 0 < sum(row.collision for row in u) < 12
+    assert all(row.collision == (row.min_clearance_m < 0) for row in u)
+
+    target = STATE  # and one that stays where it is
+    still = run(spec_of(policies, env=env, **options), tmp_path / "still")
+    assert [(row.collision, row.success) for row in still] == [(False, False)] * 12
+    assert all(row.path_length_m == pytest.approx(0, abs=1e-5) for row in still)
+
+
+def test_the_latency_is_that_of_planning_a_chunk_for_one_robot(
+    checkpoints: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    predict, at_least = PF2MPPolicy.predict_action_chunk, 0.05
+
+    def slow_for_one_robot(self: PF2MPPolicy, batch: dict, **options: Any) -> Tensor:
+        if len(batch[STATE]) == 1:
+            time.sleep(at_least)
+        return predict(self, batch, **options)
+
+    monkeypatch.setattr(PF2MPPolicy, "predict_action_chunk", slow_for_one_robot)
+    run_benchmark(spec_of({"pf2mp": checkpoints["pf2mp"]}), tmp_path)
+    assert all(1000 * at_least <= row.chunk_latency_ms < 2000 for row in rows_of(tmp_path))
+
+
+# The same for all
+
+
+def test_all_policies_get_the_same_pairs_and_in_every_repeat_the_same_noise_and_other_repeats_other_noise(
+    checkpoints: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chunks: list[tuple[Tensor, Tensor]] = []  # observed positions and goals, and the prior noise
+    predict, integrate = PF2MPPolicy.predict_action_chunk, modeling_fmp.integrate
+    observed: list[Tensor] = []
+
+    def observing(self: PF2MPPolicy, batch: dict, **options: Any) -> Tensor:
+        observed.append(HALF_WIDTH * torch.cat([batch[key].reshape(-1, 2) for key in (STATE, ENV)], dim=1))
+        chunk = predict(self, batch, **options)
+        if self.config.guidance_scale:
+            torch.rand(5)  # as a policy might that draws noise on its way, too
+        return chunk
+
+    def integrating(velocity: Any, x_0: Tensor, *arguments: Any, **options: Any) -> Tensor:
+        if len(x_0) > 1:  # not the measurement of the latency
+            chunks.append((observed[-1], x_0.clone()))
+        return integrate(velocity, x_0, *arguments, **options)
+
+    monkeypatch.setattr(PF2MPPolicy, "predict_action_chunk", observing)
+    monkeypatch.setattr(modeling_fmp, "integrate", integrating)
+    guidances = ("none", "proximal:0.8", "euler:0.01")
+    run(spec_of({"pf2mp": checkpoints["pf2mp"]}, *guidances, n_repeats=2, n_episodes=4), tmp_path)
+
+    n_chunks = 2 * 2  # two rollouts of two environments, six steps of which take two chunks of four actions
+    n_jobs = len(guidances) * 2
+    assert len(chunks) == n_jobs * n_chunks
+    jobs = [chunks[i : i + n_chunks] for i in range(0, len(chunks), n_chunks)]
+    maze = MazeEnv("umaze")
+    starts = [maze.reset(seed=EPISODE_SEED + episode)[0] for episode in range(4)]
+    expected = torch.tensor([[*start["agent_pos"], *start["environment_state"]] for start in starts])
+    for job in jobs:
+        first_chunks = torch.cat([positions for positions, _ in job[::2]])
+        torch.testing.assert_close(first_chunks, expected)
+    noise = [torch.cat([x_0 for _, x_0 in job]) for job in jobs]
+    for repeat in (0, 1):
+        for guided in noise[repeat + 2 :: 2]:
+            assert torch.equal(noise[repeat], guided)
+    every_chunk = torch.cat([noise[0], noise[1]]).flatten(1)
+    assert len(every_chunk.unique(dim=0)) == len(every_chunk) == 2 * n_chunks * 2
+
+
+def test_repeats_differ_in_the_noise_alone_and_without_guidance_a_policy_is_its_unguided_kind(
+    checkpoints: dict[str, str], tmp_path: Path
+) -> None:
+    # fmp and pf2mp have the same weights, and so have diffusion and dppf; act draws no noise.
+    policies = {"flow" if kind == "fmp" else kind: path for kind, path in checkpoints.items()}
+    rows = run(spec_of(policies, n_repeats=2), tmp_path)
+    for name, unguided in (("flow", "fmp"), ("diffusion", "dp")):
+        assert len(outcomes(rows, name)) == 2 * N_EPISODES
+        assert outcomes(rows, name) == outcomes(rows, unguided)
+    assert outcomes(rows, "flow") != outcomes(rows, "diffusion")
+    for policy, draws_noise in (("flow", True), ("diffusion", True), ("act", False)):
+        first, second = (
+            [episode[3:] for episode in outcomes(rows, policy, repeat=repeat)] for repeat in (0, 1)
+        )
+        for left, right in zip(first, second, strict=True):
+            assert (left != right) == draws_noise
+
+
+def test_results_do_not_depend_on_what_ran_before(
+    checkpoints: dict[str, str], whole: Path, whole_spec: BenchmarkSpec, tmp_path: Path
+) -> None:
+    others = {"act": checkpoints["act"], **whole_spec.policies}
+    spec = replace(whole_spec, policies=others, guidances=whole_spec.guidances[::-1])
+    rows = [row for row in run(spec, tmp_path) if row.policy in ("fmp", "pf2mp")]
+    assert sorted(rows, key=repr) == sorted(timeless(rows_of(whole)), key=repr)
+
+
+def test_the_same_command_gives_the_same_file_but_for_the_latency(
+    whole: Path, whole_spec: BenchmarkSpec, tmp_path: Path
+) -> None:
+    torch.manual_seed(123)
+    run_benchmark(whole_spec, tmp_path)
+    latency = COLUMNS.split(",").index("chunk_latency_ms")
+    first, second = (
+        [
+            [field for i, field in enumerate(line.split(",")) if i != latency]
+            for line in (folder / "episodes.csv").read_text().splitlines()
+        ]
+        for folder in (whole, tmp_path)
     )
-    assert 0 < blocked.collisions < 20
-    assert blocked.successes == 20
+    assert first == second
 
 
-def test_the_table_shows_mean_deviation_and_interval() -> None:
-    table = make_table([RESULT, replace(RESULT, repeat=1, collisions=3, successes=50)])
-    row = table.splitlines()[-1]
-    assert "| MazeLarge-v0 | pf2mp | proximal | 0.8 | 4.00 ± 2.83 |" in row
-    assert "| 1.57 to 9.84 | 99.00 ± 1.41 | 2 x 50 |" in row
+@pytest.mark.slow
+def test_processes_side_by_side_give_the_same_rows_in_the_same_order(
+    whole: Path, whole_spec: BenchmarkSpec, tmp_path: Path
+) -> None:
+    assert torch.get_num_threads() == 1  # as in each of those processes
+    run_benchmark(whole_spec, tmp_path, n_processes=2)
+    assert timeless(rows_of(tmp_path)) == timeless(rows_of(whole))
 
 
-def test_results_are_written_with_versions(tmp_path: Path) -> None:
-    write_results(tmp_path / "new/results.csv", [RESULT])
-    with (tmp_path / "new/results.csv").open() as file:
-        (row,) = csv.DictReader(file)
-    assert (row["collisions"], row["lerobot"][:3]) == ("1", "0.6")
-    assert [path.name for path in (tmp_path / "new").iterdir()] == ["results.csv"]
+# Going on
 
 
-def test_loading_refuses_what_is_neither_folder_nor_repository(checkpoint: Path, tmp_path: Path) -> None:
+def assert_goes_on(
+    folder: Path, spec: BenchmarkSpec, whole: Path, evaluations: list[float], n_kept: int
+) -> None:
+    """Running the benchmark again completes what is missing after the first `n_kept` repeats, and only that."""
+    expected = rows_of(whole)
+    n_rows = n_kept * N_EPISODES
+    summary = run_benchmark(spec, folder)
+    assert evaluations == [row.guidance_scale for row in expected[n_rows::N_EPISODES]]
+    rows = rows_of(folder)
+    assert rows[:n_rows] == expected[:n_rows]  # as they were, latency included
+    assert timeless(rows) == timeless(expected)
+    assert summary == read_rows(folder / "summary.csv", SummaryRow)
+    assert [(row.policy, row.repeat, row.collisions, row.successes) for row in summary] == [
+        (row.policy, row.repeat, row.collisions, row.successes)
+        for row in read_rows(whole / "summary.csv", SummaryRow)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("n_lines", "n_more_characters", "n_kept"),
+    [
+        (1 + 6 * N_EPISODES, 0, 6),  # finished
+        (1 + 5 * N_EPISODES, 0, 5),
+        (6 * N_EPISODES, 57, 5),  # the last line is whole but for its end
+        (1 + 4 * N_EPISODES, 1, 4),
+        (2 + 3 * N_EPISODES, 30, 3),
+    ],
+)
+def test_a_benchmark_that_was_cut_short_goes_on_where_it_was(
+    copied: Path,
+    whole: Path,
+    whole_spec: BenchmarkSpec,
+    evaluations: list[float],
+    n_lines: int,
+    n_more_characters: int,
+    n_kept: int,
+) -> None:
+    lines = (copied / "episodes.csv").read_text().splitlines(keepends=True)
+    left = "".join(lines[:n_lines]) + "".join(lines[n_lines:])[:n_more_characters]
+    (copied / "episodes.csv").write_text(left)
+    for name in ("summary.csv", "table.md", "table.tex"):
+        (copied / name).unlink()
+    assert_goes_on(copied, whole_spec, whole, evaluations, n_kept)
+
+
+def test_an_interruption_leaves_the_repeats_that_are_done(
+    whole: Path,
+    whole_spec: BenchmarkSpec,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    evaluations: list[float],
+) -> None:
+    counted = benchmark.eval_policy
+
+    def interrupted(*arguments: Any, **options: Any) -> Any:
+        if len(evaluations) == 2:
+            raise KeyboardInterrupt
+        return counted(*arguments, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(benchmark, "eval_policy", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run_benchmark(whole_spec, tmp_path)
+    assert timeless(rows_of(tmp_path)) == timeless(rows_of(whole))[: 2 * N_EPISODES]
+    shutil.copyfile(tmp_path / "episodes.csv", tmp_path / "before.csv")
+    evaluations.clear()
+    assert run(whole_spec, tmp_path) == timeless(rows_of(whole))
+    assert len(evaluations) == 4
+    assert (tmp_path / "episodes.csv").read_text().startswith((tmp_path / "before.csv").read_text())
+
+
+@pytest.mark.parametrize(
+    "begin",
+    [
+        lambda spec: replace(spec, guidances=spec.guidances[:1]),
+        lambda spec: replace(spec, guidances=spec.guidances[1:], n_repeats=1),
+    ],
+    ids=["none, then guidance", "guidance, then none and another repeat"],
+)
+def test_a_second_call_adds_what_is_new(
+    whole: Path,
+    whole_spec: BenchmarkSpec,
+    tmp_path: Path,
+    evaluations: list[float],
+    begin: Callable[[BenchmarkSpec], BenchmarkSpec],
+) -> None:
+    run_benchmark(begin(whole_spec), tmp_path)
+    first = (tmp_path / "episodes.csv").read_text()
+    summary = run_benchmark(whole_spec, tmp_path)
+    assert (tmp_path / "episodes.csv").read_text().startswith(first)
+    assert len(evaluations) == 6
+    assert sorted(timeless(rows_of(tmp_path)), key=repr) == sorted(timeless(rows_of(whole)), key=repr)
+    for row in summary:  # those that are guided now have a twin
+        assert (row.only_unguided_collides is None) == (row.guidance_scale == 0)
+    assert (tmp_path / "table.md").read_text().count(UMAZE) == 3
+
+
+def test_rows_of_a_policy_that_is_not_asked_for_any_more_stay(
+    checkpoints: dict[str, str], copied: Path, whole_spec: BenchmarkSpec, evaluations: list[float]
+) -> None:
+    before = rows_of(copied)
+    rows = run(replace(whole_spec, policies={"act": checkpoints["act"]}), copied)
+    assert len(evaluations) == 2
+    assert rows[: len(before)] == timeless(before)
+    assert {row.policy for row in rows[len(before) :]} == {"act"}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"n_episodes": 4},
+        {"episode_seed": 8},
+        {"batch_size": 3},
+        {"env": PF2MPMazeEnv(task=UMAZE, episode_length=7)},
+        {"env": PF2MPMazeEnv(task=UMAZE, episode_length=EPISODE_LENGTH, control="pd")},
+    ],
+    ids=str,
+)
+def test_other_episodes_in_the_same_folder_are_an_error(
+    copied: Path, whole: Path, whole_spec: BenchmarkSpec, evaluations: list[float], change: dict[str, Any]
+) -> None:
+    with pytest.raises(
+        ValueError, match="holds a benchmark over other episodes .* choose another --output_dir"
+    ):
+        run_benchmark(replace(whole_spec, **change), copied)
+    assert evaluations == []
+    for path in whole.iterdir():
+        assert (copied / path.name).read_bytes() == path.read_bytes()
+
+
+def test_another_meaning_of_a_variant_in_the_same_folder_is_an_error(
+    checkpoints: dict[str, str], tmp_path: Path
+) -> None:
+    policies = {"pf2mp": checkpoints["pf2mp"]}
+    rows = run(spec_of(policies, variants={"fast": {"num_inference_steps": 1}}), tmp_path)
+    with pytest.raises(ValueError, match="'fast'"):
+        run_benchmark(spec_of(policies, variants={"fast": {"num_inference_steps": 3}}), tmp_path)
+    assert timeless(rows_of(tmp_path)) == rows
+    assert json.loads((tmp_path / "run.json").read_text())["variants"]["fast"] == {"num_inference_steps": 1}
+
+
+def test_another_variant_is_added_and_both_are_noted(
+    copied: Path, whole_spec: BenchmarkSpec, evaluations: list[float]
+) -> None:
+    variants = {"fast": {"num_inference_steps": 1}}
+    spec = replace(whole_spec, variants=variants, guidances=(NONE,))
+    rows = run(spec, copied)
+    assert len(evaluations) == 2
+    assert Counter(row.variant for row in rows) == {"": 6 * N_EPISODES, "fast": 2 * N_EPISODES}
+    assert json.loads((copied / "run.json").read_text())["variants"] == {"": {}, **variants}
+
+
+def test_another_task_of_the_same_environment_is_added(
+    copied: Path, whole_spec: BenchmarkSpec, evaluations: list[float]
+) -> None:
+    env = replace(whole_spec.env, task="MazeMedium-v0")
+    rows = run(replace(whole_spec, env=env, tasks=(UMAZE, "MazeMedium-v0"), guidances=(NONE,)), copied)
+    assert evaluations == [0.0, 0.0]
+    assert Counter(row.task for row in rows) == {UMAZE: 6 * N_EPISODES, "MazeMedium-v0": 2 * N_EPISODES}
+
+
+# Loading
+
+
+def test_loading_refuses_what_is_neither_folder_nor_repository(
+    checkpoints: dict[str, str], tmp_path: Path
+) -> None:
     with pytest.raises(FileNotFoundError, match="a checkpoint's pretrained_model folder or a repository"):
         load_policy(tmp_path / "nothing")
-    policy, _, _ = load_policy(checkpoint, device="cpu", guidance_scale=0.25)
+    policy, _, _ = load_policy(checkpoints["pf2mp"], device="cpu", guidance_scale=0.25)
     assert policy.config.guidance_scale == 0.25
     assert not policy.training
     assert isinstance(policy.config, FMPConfig)

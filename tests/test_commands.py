@@ -11,12 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from lerobot.datasets import LeRobotDataset
+from test_benchmark import write_checkpoint
 from test_convert import FOREIGN_LAYOUT, demonstrations, line, write_d4rl, write_pointmaze
 
 from lerobot_pf2mp import cli
+from lerobot_pf2mp.results import EpisodeRow, read_rows
 
 BIN = Path(sys.executable).parent
 SECONDS = 120
+MAZES = ("maze_umaze", "maze_medium", "maze_large")
 COLLECT_SMALL = ("--task=maze_umaze", "--n_episodes=3", "--n_steps=5")
 
 
@@ -94,20 +97,40 @@ def test_unknown_options_end_with_the_usage_and_nothing_written(tmp_path: Path) 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", ["pf2mp-collect", "pf2mp-convert"])
-def test_help_shows_examples_units_and_defaults(command: str) -> None:
+@pytest.mark.parametrize(
+    ("command", "facts"),
+    [
+        (
+            "pf2mp-collect",
+            [
+                *MAZES,
+                "by default local/TASK",
+                "of which 1 is the largest (100 N)",
+                "(default: 80)",
+                "(default: 4000)",
+            ],
+        ),
+        ("pf2mp-convert", [*MAZES, "by default local/TASK", "(default: 80)"]),
+        (
+            "pf2mp-fit-field",
+            [
+                "diffusion becomes dppf, fmp becomes pf2mp",
+                "[normalised action units], or likelihood, scott or silverman",
+                "lambda, the strength of the guidance",
+                "--policy.path",
+                "--dataset.repo_id",
+                "--output_dir",
+            ],
+        ),
+    ],
+)
+def test_help_shows_examples_units_and_defaults(command: str, facts: list[str]) -> None:
     result = run(command, "--help")
     assert result.returncode == 0
     assert result.stderr == ""
     words = " ".join(result.stdout.split())
     assert f"Examples: {command} --" in words
-    assert "by default local/TASK" in words
-    assert "(default: 80)" in words
-    if command == "pf2mp-collect":
-        assert "of which 1 is the largest (100 N)" in words
-        assert "(default: 4000)" in words
-    for task in ("maze_umaze", "maze_medium", "maze_large"):
-        assert task in words
+    assert [fact for fact in facts if fact not in words] == []
 
 
 @pytest.mark.slow
@@ -301,4 +324,99 @@ def test_bad_values_for_convert_end_in_one_line_and_nothing_written(
     Path("text.hdf5").write_text("404")
     before = everything_in(tmp_path)
     assert refused(cli.convert, f"--root={tmp_path / 'd'}", *options).startswith(message)
+    assert everything_in(tmp_path) == before
+
+
+# pf2mp-benchmark
+
+
+BENCHMARK_SMALL = (
+    "--env.type=pf2mp_maze",
+    "--env.task=MazeUMaze-v0",
+    "--env.episode_length=2",
+    "--n_episodes=2",
+    "--batch_size=1",
+)
+
+
+@pytest.mark.slow
+def test_benchmark_compares_policies_and_prints_the_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for seed in (1, 2):
+        write_checkpoint(tmp_path / f"policy_{seed}", "pf2mp", seed)
+    act = write_checkpoint(tmp_path / "act", "act")
+    options = (
+        f"--policies={{pf2mp: '{tmp_path}/policy_{{seed}}', act: {act}}}",
+        '--guidance=[none, "proximal:0.08,0.8"]',
+        '--variants={"": {}, one step: {}}',
+        "--seeds=[1, 2]",
+        "--n_repeats=1",
+        f"--output_dir={tmp_path / 'new' / 'benchmark'}",
+    )
+    monkeypatch.setattr(sys, "argv", ["pf2mp-benchmark", *BENCHMARK_SMALL, *options])
+    cli.benchmark()
+    output = capsys.readouterr().out
+    table = (tmp_path / "new/benchmark/table.md").read_text()
+    assert output.endswith(f"{table}\nWrote {tmp_path / 'new' / 'benchmark'}.\n")
+    assert [tuple(row.split(" | ")[1:5]) for row in table.splitlines()[2:]] == [
+        (policy, *guidance, variant)
+        for policy, kinds in (
+            ("fmp", [("none", "")]),
+            ("pf2mp", [("proximal", "0.08"), ("proximal", "0.8")]),
+            ("act", [("none", "")]),
+        )
+        for guidance in kinds
+        for variant in ("", "one step")
+    ] or table
+    rows = read_rows(tmp_path / "new/benchmark/episodes.csv", EpisodeRow)
+    assert len(rows) == (3 + 1) * 2 * 2 * 2
+    assert {row.checkpoint for row in rows if row.seed == 2} == {f"{tmp_path}/policy_2", act}
+
+
+@pytest.mark.slow
+def test_help_of_benchmark_shows_examples_and_defaults(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["pf2mp-benchmark", "--help"])
+    with pytest.raises(SystemExit, match="0"):
+        cli.benchmark()
+    words = " ".join(capsys.readouterr().out.split())
+    for fact in (
+        "Examples: pf2mp-benchmark --policies='{pf2mp: ",
+        "none, or INTEGRATOR:LAMBDA,LAMBDA,... (default: ['none', 'proximal:0.8'])",
+        "(default: 500)",
+        "{seed} and {task} in a path are replaced",
+    ):
+        assert fact in words
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--policies={}"], "error: policies must name at least one, got none"),
+        (["--policies=pf2mp"], "error: `policies`"),
+        (
+            ["--policies={pf2mp: nowhere}"],
+            "error: path must be a checkpoint's pretrained_model folder or a repository",
+        ),
+        (["--guidance=[off]"], "error: guidance must be none or INTEGRATOR:SCALE,SCALE,..."),
+        (["--guidance=none"], "error: `guidance`"),
+        (["--n_episodes=0"], "error: n_episodes must be at least 1, got 0"),
+        (["--n_repeats=0"], "error: n_repeats must be at least 1, got 0"),
+        (["--n_processes=0"], "error: n_processes must be at least 1, got 0"),
+        (["--seeds=[]"], "error: seeds must name at least one, got none"),
+        (["--seeds=[first]"], "error: `seeds"),
+        (["--env.task=MazeHuge-v0"], "error: task must be one of"),
+    ],
+)
+def test_bad_values_for_benchmark_end_in_one_line_and_nothing_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Callable[..., str], options: list, message: str
+) -> None:
+    policy = write_checkpoint(tmp_path / "policy", "fmp")
+    monkeypatch.chdir(tmp_path)
+    before = everything_in(tmp_path)
+    given = (*BENCHMARK_SMALL, f"--policies={{fmp: {policy}}}", "--output_dir=out", *options)
+    assert refused(cli.benchmark, *given).startswith(message)
     assert everything_in(tmp_path) == before

@@ -3,10 +3,15 @@ import math
 
 import pytest
 import torch
+from lerobot.configs import FeatureType, PolicyFeature
 
+from lerobot_pf2mp import PF2MPConfig
+from lerobot_pf2mp.errors import ConfigError
 from lerobot_pf2mp.flow_matching import integrate
-from lerobot_pf2mp.guidance import GUIDANCE_INTEGRATORS, make_guide
+from lerobot_pf2mp.guidance import GUIDANCE_INTEGRATORS, GUIDANCE_POINTS, make_guide
+from lerobot_pf2mp.policies.pf2mp.modeling_pf2mp import PF2MPPolicy
 from lerobot_pf2mp.potential_field import PotentialField, fit
+from lerobot_pf2mp.potential_field_processor import POTENTIAL_FIELD, DemonstratedActions
 
 
 def random_field(dim: int = 2, alpha: float = 0.0, bandwidth: float = 0.2) -> PotentialField:
@@ -138,6 +143,128 @@ def test_dimensions_without_a_field_pass_bit_for_bit(integrator, dims):
     assert torch.equal(guided[..., list(dims)], alone)
     assert torch.equal(x_next, before)
     assert not torch.equal(alone, x_next[..., list(dims)])
+
+
+# Where the field is asked.
+
+
+def three_points(dim: int = 2) -> dict[str, torch.Tensor]:
+    """Where a step begins, what it predicts and where it ends, by the names of `GUIDANCE_POINTS`."""
+    return {point: torch.randn(4, 8, dim) for point in ("current", "end", "next")}
+
+
+def test_the_guidance_points_are_the_start_the_predicted_end_and_the_next_sample():
+    assert set(GUIDANCE_POINTS) == set(three_points())
+
+
+@pytest.mark.parametrize(("integrator", "default"), [("euler", "current"), ("proximal", "end")])
+@pytest.mark.parametrize("dims", [None, [1, 0]])
+@pytest.mark.parametrize("alpha", [0.0, -3.0])
+def test_the_default_point_of_each_integrator_can_be_named(integrator, default, dims, alpha):
+    field, x = random_field(2, alpha), three_points()
+    step = x["current"], x["next"], x["end"], 0.2
+    unnamed = make_guide(field, 0.05, integrator, dims)(*step)
+    for point in GUIDANCE_POINTS:
+        named = make_guide(field, 0.05, integrator, dims, point)(*step)
+        assert torch.equal(named, unnamed) == (point == default)
+
+
+@pytest.mark.parametrize("alpha", [0.0, -3.0])
+@pytest.mark.parametrize("point", GUIDANCE_POINTS)
+def test_the_euler_guide_adds_lambda_dt_times_the_field_at_its_point(point, alpha):
+    field, scale, dt, x = random_field(2, alpha), 0.05, 0.2, three_points()
+    guided = make_guide(field, scale, "euler", point=point)(x["current"], x["next"], x["end"], dt)
+    expected = x["next"] + scale * dt * field.potential_gradient(x[point])
+    torch.testing.assert_close(guided, expected)
+
+
+@pytest.mark.parametrize("scale", [0.05, 10.0])
+@pytest.mark.parametrize("point", GUIDANCE_POINTS)
+def test_the_proximal_guide_adds_its_share_of_the_mean_shift_at_its_point(point, scale):
+    field, dt, x = random_field(), 0.2, three_points()
+    guided = make_guide(field, scale, "proximal", point=point)(x["current"], x["next"], x["end"], dt)
+    share = 1 - math.exp(-scale * dt / field.bandwidth**2)
+    expected = x["next"] + share * (field.local_mean(x[point]) - x[point])
+    torch.testing.assert_close(guided, expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("point", GUIDANCE_POINTS)
+def test_the_distance_term_of_the_proximal_guide_goes_on_from_its_shifted_point(point):
+    field, scale, dt = random_field(2, -2.0, bandwidth=0.1), 0.5, 0.2
+    x = {name: 3 * a for name, a in three_points().items()}
+    guided = make_guide(field, scale, "proximal", point=point)(x["current"], x["next"], x["end"], dt)
+    shift = (1 - math.exp(-scale * dt / field.bandwidth**2)) * field.mean_shift(x[point])
+    offset = field.offset_to_safe_set(x[point] + shift)
+    length = offset.norm(dim=-1, keepdim=True)
+    assert (length > 0).any()
+    expected = x["next"] + shift + (2 * scale * dt / length.clamp_min(1e-12)).clamp_max(1) * offset
+    torch.testing.assert_close(guided, expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("integrator", GUIDANCE_INTEGRATORS)
+@pytest.mark.parametrize("n_steps", [1, 5])
+def test_the_predicted_end_is_the_next_sample_on_the_last_step_of_a_flow_and_only_there(integrator, n_steps):
+    field, agrees = random_field(2, -1.0), []
+    end, after = (make_guide(field, 0.05, integrator, point=point) for point in ("end", "next"))
+
+    def compare(*step):
+        agrees.append(torch.equal(end(*step), after(*step)))
+        return step[1]
+
+    integrate(lambda x, t: -x, torch.randn(4, 8, 2), n_steps, guide=compare)
+    assert agrees == [False] * (n_steps - 1) + [True]
+
+
+@pytest.mark.parametrize("integrator", GUIDANCE_INTEGRATORS)
+@pytest.mark.parametrize("point", GUIDANCE_POINTS)
+def test_a_point_is_asked_for_in_the_dimensions_of_the_field(integrator, point):
+    field, x, dims = random_field(2, -1.0), three_points(4), [3, 1]
+    guided = make_guide(field, 0.05, integrator, dims, point)(x["current"], x["next"], x["end"], 0.2)
+    covered = {name: a[..., dims] for name, a in x.items()}
+    alone = make_guide(field, 0.05, integrator, point=point)(
+        covered["current"], covered["next"], covered["end"], 0.2
+    )
+    assert torch.equal(guided[..., dims], alone)
+    assert torch.equal(guided[..., [0, 2]], x["next"][..., [0, 2]])
+
+
+@pytest.mark.parametrize("integrator", GUIDANCE_INTEGRATORS)
+@pytest.mark.parametrize("scale", [0.0, 0.5])
+def test_an_unknown_guidance_point_is_an_error_that_names_the_choices(integrator, scale):
+    with pytest.raises(
+        ValueError, match=r"guidance_point must be one of .*current.*end.*next.* or None, got 'start'"
+    ):
+        make_guide(random_field(), scale, integrator, point="start")
+
+
+def test_an_unknown_guidance_point_in_a_configuration_is_an_error_that_names_the_choices():
+    with pytest.raises(
+        ConfigError, match=r"guidance_point must be one of .*current.*end.*next.* or null, got 'start'"
+    ):
+        PF2MPConfig(device="cpu", guidance_point="start")
+
+
+@pytest.mark.parametrize(("integrator", "default"), [("euler", "current"), ("proximal", "end")])
+@pytest.mark.parametrize("point", [None, *GUIDANCE_POINTS])
+def test_the_guidance_point_of_the_configuration_is_that_of_the_policys_guide(integrator, default, point):
+    config = PF2MPConfig(
+        device="cpu",
+        horizon=8,
+        n_action_steps=4,
+        down_dims=(8, 16),
+        diffusion_step_embed_dim=16,
+        input_features={"observation.state": PolicyFeature(FeatureType.STATE, (3,))},
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (2,))},
+        guidance_integrator=integrator,
+        guidance_point=point,
+    )
+    shown = DemonstratedActions(config.field_settings)
+    shown.observe(torch.randn(40, 8, 2), None, None, settings=config.field_settings)
+    guide = PF2MPPolicy(config).make_guide({POTENTIAL_FIELD: shown})
+    assert guide.point == (point or default)
+
+
+# Rules and modes.
 
 
 @pytest.mark.parametrize("integrator", GUIDANCE_INTEGRATORS)

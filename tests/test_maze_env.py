@@ -495,6 +495,33 @@ def test_a_centre_may_pass_where_a_ball_collides() -> None:
         assert info["clearance"] == pytest.approx(0.05 - radius, abs=1e-5)
 
 
+def test_the_path_length_is_that_of_the_way_so_far_in_this_episode() -> None:
+    env = MazeEnv(CORRIDOR)
+    way = np.array([(-2.0, 0.0), (-1.7, 0.4), (-1.7, 0.4), (-1.7, -0.2), (1.0, 0.0), (1.0, 0.45), (1.2, 0.3)])
+    for _ in range(2):  # a second episode begins at zero again
+        _, info = env.reset(seed=0, options={"start": way[0], "goal": (2.0, 0.0)})
+        assert info["path_length"] == 0.0
+        for n_steps, position in enumerate(way[1:], start=1):
+            *_, info = env.step(position)
+            polyline = np.linalg.norm(np.diff(way[: n_steps + 1], axis=0), axis=1).sum()
+            assert info["path_length"] == pytest.approx(polyline, abs=1e-6)
+        assert info["is_collision"]  # which does not stop the count
+
+
+def test_the_path_length_of_a_pd_ball_is_that_of_the_way_it_takes() -> None:
+    env = MazeEnv(CORRIDOR, control="pd")
+    observation, info = env.reset(seed=0, options={"start": (-2.0, 0.0), "goal": (2.0, 0.0)})
+    straight = 0.0
+    for x, y in [(-1.8, 0.0), (-1.6, 0.1), (-1.4, 0.0), (-1.6, 0.0), (-1.8, 0.0)]:
+        before, length = observation["agent_pos"], info["path_length"]
+        observation, *_, info = env.step(np.array([x, y]))
+        straight += np.linalg.norm(observation["agent_pos"] - before)
+        assert info["path_length"] > length
+    # Between the ends of its steps it swings, most of all where it turns round.
+    assert 1.001 * straight < info["path_length"] < 1.2 * straight
+    assert env.reset(seed=0)[1]["path_length"] == 0.0
+
+
 @pytest.mark.parametrize("terminate_on_success", [False, True])
 def test_success_is_being_within_45_centimetres_of_the_goal(terminate_on_success: bool) -> None:
     env = MazeEnv(CORRIDOR, terminate_on_success=terminate_on_success)
