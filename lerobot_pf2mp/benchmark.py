@@ -7,6 +7,7 @@ pair by pair. Evaluation is LeRobot's own, on vectorised environments.
 
 from __future__ import annotations
 
+import csv
 import io
 import json
 import multiprocessing
@@ -180,7 +181,7 @@ def run_benchmark(spec: BenchmarkSpec, output_dir: Path, *, n_processes: int = 1
         tqdm(total=len(jobs), initial=len(jobs) - len(missing), desc="Benchmark", unit="repeat") as bar,
     ):
         for rows in _evaluate_all(spec, missing, n_processes):
-            file.write("".join(",".join(format_row(row)) + "\n" for row in rows))
+            csv.writer(file, lineterminator="\n").writerows(map(format_row, rows))
             file.flush()
             bar.update()
     summary = summarise(read_rows(episodes, EpisodeRow))
@@ -194,6 +195,7 @@ def run_benchmark(spec: BenchmarkSpec, output_dir: Path, *, n_processes: int = 1
 def _make_jobs(spec: BenchmarkSpec) -> list[_Job]:
     jobs = []
     for task in spec.tasks:
+        replace(spec.env, task=task)  # an unknown task is an error now rather than in the middle
         for name, template in spec.policies.items():
             for seed in spec.seeds:
                 checkpoint = template.replace("{task}", task).replace("{seed}", str(seed))
@@ -251,6 +253,12 @@ def _claim(output_dir: Path, spec: BenchmarkSpec) -> None:
                 f"{output_dir} holds a benchmark over other episodes ({found['episodes']}), got {episodes}: choose another "
                 "--output_dir"
             )
+        for name, changes in json.loads(json.dumps(variants)).items():
+            if found["variants"].get(name, changes) != changes:
+                raise ValueError(
+                    f"{output_dir} holds results of a variant {name!r} with {found['variants'][name]}, got {changes}: choose "
+                    "another name or another --output_dir"
+                )
         variants = {**found["variants"], **variants}
     made_with = {
         name: version(name) for name in ("lerobot", "torch", "mujoco", "gymnasium-robotics", "diffusers")

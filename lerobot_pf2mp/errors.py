@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one error type of this package, everything else raises Python's own; and the exit code of an interruption."""
+"""The one error type of this package, everything else raises Python's own; and how errors reach the user."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,3 +24,26 @@ def reported_on_the_command_line() -> Iterator[None]:
         yield
     except ValueError as error:
         raise ConfigError(str(error)) from error
+
+
+@contextmanager
+def explained(what: str) -> Iterator[None]:
+    """Turns any error of the block, of whichever library, into one of Python's own that says what could not be done.
+
+    Args:
+        what: What failed, for example "the checkpoint outputs/pf2mp cannot be loaded".
+
+    Raises:
+        OSError: For an OSError.
+        ValueError: For any other error.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise OSError(f"{what}: {_said_by(error)}") from error
+    except Exception as error:
+        raise ValueError(f"{what}: {_said_by(error)}") from error
+
+
+def _said_by(error: Exception) -> str:
+    return str(error) or type(error).__name__

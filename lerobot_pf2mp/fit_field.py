@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -11,15 +12,17 @@ from typing import Any, cast
 import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.lerobot_types import TransitionKey
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
-from lerobot.processor import NormalizerProcessorStep, PolicyProcessorPipeline
+from lerobot.processor import DeviceProcessorStep, NormalizerProcessorStep, PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 from tqdm import tqdm
 
+from lerobot_pf2mp.errors import explained
 from lerobot_pf2mp.loading import load_config
 from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
 from lerobot_pf2mp.potential_field_processor import PotentialFieldProcessorStep
@@ -63,35 +66,68 @@ def fit_field(
 
     Raises:
         ValueError: If the checkpoint is of another type, its actions are not the dataset's, or an option breaks its rule.
-        FileNotFoundError: If the checkpoint does not exist or lacks its preprocessor.
+        OSError: If the checkpoint or the dataset cannot be read.
         FileExistsError: If `output_dir` exists and `overwrite` is false.
     """
-    config = load_config(checkpoint, revision=checkpoint_revision, device="cpu")
+    config = load_config(checkpoint, revision=checkpoint_revision)
     guided = _guided_config(config, options or {})
+    device, config.device, guided.device = guided.device, "cpu", "cpu"
     with written_beside(output_dir, overwrite, mark="config.json", option="--output_dir") as partial:
-        policy_class = get_policy_class(guided.type)
-        policy = policy_class.from_pretrained(checkpoint, config=guided, revision=checkpoint_revision)
-        preprocessor, postprocessor = make_pre_post_processors(
-            config,
-            pretrained_path=str(checkpoint),
-            pretrained_revision=checkpoint_revision,
-            preprocessor_overrides={"device_processor": {"device": "cpu"}},
-        )
-        dataset = LeRobotDataset(
-            repo_id,
-            root=root,
-            episodes=None if episodes is None else list(episodes),
-            revision=dataset_revision,
-            download_videos=False,
-        )
+        with explained(f"the checkpoint {checkpoint} cannot be loaded"):
+            policy_class = get_policy_class(guided.type)
+            policy = policy_class.from_pretrained(checkpoint, config=guided, revision=checkpoint_revision)
+            preprocessor, postprocessor = _load_processors(config, str(checkpoint), checkpoint_revision)
+        dataset = _load_dataset(repo_id, root, episodes, dataset_revision)
         step = _fitted_step(guided, dataset, preprocessor)
         preprocessor.steps = [
             *(old for old in preprocessor.steps if not isinstance(old, PotentialFieldProcessorStep)),
             step,
         ]
+        # Only the fitting is done on the CPU.
+        guided.device = device
+        for old in preprocessor.steps:
+            if isinstance(old, DeviceProcessorStep):
+                old.device = str(device)
         for part in (policy, preprocessor, postprocessor):
             part.save_pretrained(partial)
     return guided
+
+
+def _load_processors(
+    config: PreTrainedConfig, checkpoint: str, revision: str | None
+) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
+    if Path(checkpoint).is_dir() and not (Path(checkpoint) / "policy_preprocessor.json").is_file():
+        raise FileNotFoundError("it has no policy_preprocessor.json")
+    return make_pre_post_processors(
+        config,
+        pretrained_path=checkpoint,
+        pretrained_revision=revision,
+        preprocessor_overrides={"device_processor": {"device": "cpu"}},
+    )
+
+
+def _load_dataset(
+    repo_id: str, root: Path | None, episodes: Sequence[int] | None, revision: str | None
+) -> LeRobotDataset:
+    is_new = root is not None and not root.exists()
+    try:
+        with explained(f"the dataset {repo_id}{f' in {root}' if root else ''} cannot be read"):
+            n_episodes = LeRobotDatasetMetadata(repo_id, root=root, revision=revision).total_episodes
+            if episodes is not None and (
+                not episodes or not 0 <= min(episodes) <= max(episodes) < n_episodes
+            ):
+                raise ValueError(f"episodes must be some of 0 to {n_episodes - 1}, got {list(episodes)}")
+            return LeRobotDataset(
+                repo_id,
+                root=root,
+                episodes=None if episodes is None else list(episodes),
+                revision=revision,
+                download_videos=False,
+            )
+    except Exception:
+        if is_new and root is not None:
+            shutil.rmtree(root, ignore_errors=True)  # LeRobot begins to download into it
+        raise
 
 
 def _guided_config(config: PreTrainedConfig, options: dict[str, Any]) -> PreTrainedConfig:

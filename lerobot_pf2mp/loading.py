@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,8 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy, make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
 from lerobot.processor import PolicyAction, PolicyProcessorPipeline
+
+from lerobot_pf2mp.errors import explained
 
 
 def load_policy(
@@ -53,10 +56,14 @@ def load_config(
         raise FileNotFoundError(
             f"path must be a checkpoint's pretrained_model folder or a repository user/name, got {path}"
         )
-    options = [f"--{name}={value}" for name, value in overrides.items()]
     if device is not None:
-        options.append(f"--device={device}")
-    config = PreTrainedConfig.from_pretrained(path, revision=revision, cli_overrides=options)
+        overrides["device"] = device
+    options = [
+        f"--{name}={value if isinstance(value, str) else json.dumps(value)}"
+        for name, value in overrides.items()
+    ]
+    with explained(f"the checkpoint {path} cannot be loaded"):
+        config = PreTrainedConfig.from_pretrained(path, revision=revision, cli_overrides=options)
     # LeRobot leaves this empty; without it the processors would be built anew, with neither statistics nor field.
     config.pretrained_path = Path(path)
     return config

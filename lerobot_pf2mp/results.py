@@ -268,9 +268,16 @@ def read_rows[Row](path: Path, row_type: type[Row]) -> list[Row]:
     if list(reader.fieldnames or []) != list(fields):
         raise ValueError(f"{path} must have the columns {list(fields)}, got {list(reader.fieldnames or [])}")
     try:
-        return [row_type(**{name: _parse(line[name], fields[name]) for name in fields}) for line in reader]
+        return [_parse_row(line, fields, row_type) for line in reader]
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path} must hold one result on each line: {error}") from error
+
+
+def _parse_row[Row](line: dict[str, str], fields: dict[str, str], row_type: type[Row]) -> Row:
+    values = list(line.values())
+    if None in line or None in values:  # DictReader's marks for too many and too few values
+        raise ValueError(f"a line must have {len(fields)} values, got {values}")
+    return row_type(**{name: _parse(line[name], kind) for name, kind in fields.items()})
 
 
 def _format(value: object) -> str:

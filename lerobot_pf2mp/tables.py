@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 from lerobot_pf2mp.rate import Rate
@@ -83,12 +84,9 @@ def _p_value(p: float) -> str:
 
 
 def _escape(text: str) -> str:
-    for character, command in (
-        ("_", r"\_"),
-        ("%", r"\%"),
-        ("±", r"$\pm$"),
-        (" x ", r" $\times$ "),
-        ("<", "$<$"),
-    ):
-        text = text.replace(character, command)
-    return r"$\lambda$" if text == "lambda" else text
+    if text == "lambda":
+        return r"$\lambda$"
+    text = re.sub(r"([&%$#_{}])", r"\\\1", text)
+    for plain, command in (("±", r"$\pm$"), (" x ", r" $\times$ "), ("<", "$<$")):
+        text = text.replace(plain, command)
+    return text

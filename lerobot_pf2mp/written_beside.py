@@ -6,7 +6,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 
@@ -36,6 +36,7 @@ def written_beside(folder: Path, overwrite: bool, *, mark: str, option: str) -> 
             raise FileExistsError(
                 f"{folder} holds no {mark} and will not be overwritten: choose another {option}"
             )
+    made = [parent for parent in folder.absolute().parents if not parent.exists()]
     folder.parent.mkdir(parents=True, exist_ok=True)
     workspace = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".partial", dir=folder.parent))
     try:
@@ -44,6 +45,9 @@ def written_beside(folder: Path, overwrite: bool, *, mark: str, option: str) -> 
         _swap(partial, folder, spare=workspace / "old")
     finally:
         shutil.rmtree(workspace, ignore_errors=True)
+        for parent in made:
+            with suppress(OSError):  # it holds something, the folder above all
+                parent.rmdir()
 
 
 def _swap(new: Path, folder: Path, spare: Path) -> None:
