@@ -256,8 +256,8 @@ def _claim(output_dir: Path, spec: BenchmarkSpec) -> None:
         for name, changes in json.loads(json.dumps(variants)).items():
             if found["variants"].get(name, changes) != changes:
                 raise ValueError(
-                    f"{output_dir} holds results of a variant {name!r} with {found['variants'][name]}, got {changes}: choose "
-                    "another name or another --output_dir"
+                    f"{output_dir} holds results of a variant {name!r} with {found['variants'][name]}, got {changes}: "
+                    "choose another name or another --output_dir"
                 )
         variants = {**found["variants"], **variants}
     made_with = {
