@@ -61,7 +61,7 @@ def write_dataset(
         FileExistsError: If `root` exists and `overwrite` is false.
         ValueError: If there is no episode, or an array is not finite or of the wrong shape.
     """
-    with written_beside(root, overwrite, mark="meta/info.json", option="--root") as partial:
+    with written_beside(root, overwrite, kind="dataset", mark="meta/info.json", option="--root") as partial:
         meta = LeRobotDatasetMetadata.create(
             spec.repo_id,
             fps=spec.fps,

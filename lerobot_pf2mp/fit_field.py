@@ -71,8 +71,11 @@ def fit_field(
     """
     config = load_config(checkpoint, revision=checkpoint_revision)
     guided = _guided_config(config, options or {})
+    guided.validate_features()
     device, config.device, guided.device = guided.device, "cpu", "cpu"
-    with written_beside(output_dir, overwrite, mark="config.json", option="--output_dir") as partial:
+    with written_beside(
+        output_dir, overwrite, kind="checkpoint", mark="config.json", option="--output_dir"
+    ) as partial:
         with explained(f"the checkpoint {checkpoint} cannot be loaded"):
             policy_class = get_policy_class(guided.type)
             policy = policy_class.from_pretrained(checkpoint, config=guided, revision=checkpoint_revision)
@@ -124,7 +127,7 @@ def _load_dataset(
                 revision=revision,
                 download_videos=False,
             )
-    except Exception:
+    except BaseException:
         if is_new and root is not None:
             shutil.rmtree(root, ignore_errors=True)  # LeRobot begins to download into it
         raise

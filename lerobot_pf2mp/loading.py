@@ -34,7 +34,8 @@ def load_policy(
         The policy, the preprocessor and the postprocessor.
 
     Raises:
-        FileNotFoundError: If there is neither such a folder nor such a repository.
+        FileNotFoundError: If the path is neither a folder nor the name of a repository.
+        OSError: If the checkpoint cannot be read or reached.
     """
     config = load_config(path, revision=revision, device=device, **overrides)
     policy = get_policy_class(config.type).from_pretrained(path, config=config, revision=revision)
@@ -62,7 +63,8 @@ def load_config(
         f"--{name}={value if isinstance(value, str) else json.dumps(value)}"
         for name, value in overrides.items()
     ]
-    with explained(f"the checkpoint {path} cannot be loaded"):
+    at_revision = f" at revision {revision}" if revision else ""
+    with explained(f"the checkpoint {path}{at_revision} cannot be loaded"):
         config = PreTrainedConfig.from_pretrained(path, revision=revision, cli_overrides=options)
     # LeRobot leaves this empty; without it the processors would be built anew, with neither statistics nor field.
     config.pretrained_path = Path(path)

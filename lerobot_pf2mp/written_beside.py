@@ -11,12 +11,13 @@ from pathlib import Path
 
 
 @contextmanager
-def written_beside(folder: Path, overwrite: bool, *, mark: str, option: str) -> Iterator[Path]:
+def written_beside(folder: Path, overwrite: bool, *, kind: str, mark: str, option: str) -> Iterator[Path]:
     """A temporary folder beside `folder` that takes its place at the end, and vanishes if anything goes wrong.
 
     Args:
         folder: The folder to be written.
         overwrite: Whether a folder already there is replaced.
+        kind: What the folder holds, for error messages.
         mark: A file inside by which a folder that may be replaced is known.
         option: The command-line option that chose the folder, for error messages.
 
@@ -34,7 +35,7 @@ def written_beside(folder: Path, overwrite: bool, *, mark: str, option: str) -> 
             )
         if not (folder / mark).is_file():
             raise FileExistsError(
-                f"{folder} holds no {mark} and will not be overwritten: choose another {option}"
+                f"{folder} is no {kind}, it holds no {mark}, and will not be overwritten: choose another {option}"
             )
     made = [parent for parent in folder.absolute().parents if not parent.exists()]
     folder.parent.mkdir(parents=True, exist_ok=True)

@@ -190,6 +190,10 @@ def config_of(checkpoint: Path) -> dict[str, Any]:
     return json.loads((checkpoint / "config.json").read_text())
 
 
+def steps_of(checkpoint: Path) -> list[dict[str, Any]]:
+    return json.loads((checkpoint / "policy_preprocessor.json").read_text())["steps"]
+
+
 def field_of(checkpoint: Path) -> dict[str, Tensor]:
     return load_file(checkpoint / FIELD_FILE)
 
@@ -281,14 +285,14 @@ def test_the_new_checkpoint_is_of_the_guided_type_and_holds_one_field(name, chec
     expected = GUIDED_TYPES[CHECKPOINTS[name][0]]
     assert (config.type, config_of(new)["type"]) == (expected, expected)
     assert everything_in(new) == sorted({*everything_in(old), FIELD_FILE})
-    steps = json.loads((new / "policy_preprocessor.json").read_text())["steps"]
-    assert [step["registry_name"] for step in steps] == [
+    assert [step["registry_name"] for step in steps_of(new)] == [
         "rename_observations_processor",
         "to_batch_processor",
         "device_processor",
         "normalizer_processor",
         "potential_field",
     ]
+    assert steps_of(new)[:4] == steps_of(old)[:4]
     assert [path.name for path in tmp_path.iterdir()] == ["new"]
 
 
@@ -346,7 +350,9 @@ def test_the_device_of_the_old_checkpoint_is_kept(checkpoint, shown, tmp_path, m
         text = (old / file).read_text()
         assert '"device": "cpu"' in text
         (old / file).write_text(text.replace('"device": "cpu"', '"device": "cuda"'))
-    assert config_of(fit(old, tmp_path / "new", shown))["device"] == "cuda"
+    new = fit(old, tmp_path / "new", shown)
+    assert config_of(new)["device"] == "cuda"
+    assert steps_of(new)[:4] == steps_of(old)
 
 
 @pytest.mark.parametrize("name", ["diffusion", "fmp", "dppf", "pf2mp"])
@@ -550,7 +556,7 @@ def test_a_checkpoint_that_does_not_exist_is_refused(shown, tmp_path):
 def test_a_checkpoint_that_lacks_a_file_is_refused(file, checkpoint, shown, tmp_path):
     old = damaged(checkpoint("diffusion"), tmp_path / "old", lambda path: (path / file).unlink())
     before = everything_in(tmp_path)
-    with pytest.raises(FileNotFoundError, match=file):
+    with pytest.raises(OSError, match=f"{old} cannot be loaded: .*{file}"):
         fit(old, tmp_path / "new", shown)
     assert everything_in(tmp_path) == before
 
@@ -590,7 +596,9 @@ def test_a_checkpoint_can_be_replaced_by_itself_with_a_field(checkpoint, fitted,
 def test_a_folder_that_is_no_checkpoint_is_never_replaced(checkpoint, shown, tmp_path):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis/chapter.tex").write_text("precious")
-    with pytest.raises(FileExistsError, match="holds no config.json and will not be overwritten"):
+    with pytest.raises(
+        FileExistsError, match="is no checkpoint, it holds no config.json, and will not be overwritten"
+    ):
         fit(checkpoint("fmp"), tmp_path / "thesis", shown, overwrite=True)
     assert contents_of(tmp_path) == {"thesis/chapter.tex": b"precious"}
 
@@ -636,10 +644,19 @@ def test_a_failure_leaves_no_empty_folders(checkpoint, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
 
 
-def test_a_dataset_that_does_not_exist_does_not_appear_as_an_empty_folder(checkpoint, tmp_path):
-    with pytest.raises(OSError, match="none"):
-        fit(checkpoint("fmp"), tmp_path / "new", tmp_path / "none")
+@pytest.mark.parametrize("root", ["none", "made/on/the/way"])
+def test_a_dataset_that_does_not_exist_does_not_appear_as_an_empty_folder(root, checkpoint, tmp_path):
+    with pytest.raises(OSError, match=f"the dataset local/{Path(root).name} in .*{root} cannot be read"):
+        fit(checkpoint("fmp"), tmp_path / "new", tmp_path / root)
     assert everything_in(tmp_path) == []
+
+
+def test_a_folder_that_is_no_dataset_stays_as_it_is(checkpoint, tmp_path):
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis/chapter.tex").write_text("precious")
+    with pytest.raises(OSError, match="the dataset local/thesis in .*thesis cannot be read"):
+        fit(checkpoint("fmp"), tmp_path / "new", tmp_path / "thesis")
+    assert contents_of(tmp_path) == {"thesis/chapter.tex": b"precious"}
 
 
 # The command.
@@ -731,7 +748,7 @@ def test_a_bad_value_ends_in_one_line_and_nothing_written(
     option, message, checkpoint, shown, tmp_path, refused
 ):
     line = refused(*arguments(checkpoint("diffusion"), shown, tmp_path / "new"), option)
-    assert re.match(f"error: {message}", line), line
+    assert re.match(f"error: (.*: )?{message}", line), line
     assert everything_in(tmp_path) == []
 
 
@@ -749,8 +766,11 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
         "policy_preprocessor_step_3_normalizer_processor.safetensors",
     ),
     "no_configuration": (lambda path: (path / "config.json").unlink(), "config.json not found in"),
-    "half_a_configuration": (lambda path: (path / "config.json").write_text("{"), ""),
-    "truncated_weights": (lambda path: (path / "model.safetensors").write_bytes(b"half"), ""),
+    "half_a_configuration": (lambda path: (path / "config.json").write_text("{"), "old cannot be loaded: "),
+    "truncated_weights": (
+        lambda path: (path / "model.safetensors").write_bytes(b"half"),
+        "old cannot be loaded: ",
+    ),
     "another_policy": (
         lambda path: ACTConfig(device="cpu").save_pretrained(path),
         "the checkpoint's type must be one of",
@@ -779,7 +799,9 @@ def half_of_the_frames(data: Path) -> None:
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
 
 
-@pytest.mark.parametrize(("damage", "message"), [(old_format, "2.1 format"), (half_of_the_frames, "")])
+@pytest.mark.parametrize(
+    ("damage", "message"), [(old_format, "2.1 format"), (half_of_the_frames, "data cannot be read: ")]
+)
 def test_a_damaged_dataset_ends_in_one_line_and_nothing_written(
     damage, message, checkpoint, shown, tmp_path, refused
 ):
@@ -789,10 +811,11 @@ def test_a_damaged_dataset_ends_in_one_line_and_nothing_written(
     assert everything_in(tmp_path) == before
 
 
-@pytest.mark.parametrize("episodes", ["[]", "[99]", "[0,99]", "[-1]"])
+@pytest.mark.parametrize("episodes", ["[]", "[5]", "[0,99]", "[-1]"])
 def test_episodes_that_the_dataset_does_not_have_are_named(episodes, checkpoint, shown, tmp_path, refused):
     options = arguments(checkpoint("fmp"), shown, tmp_path / "new")
-    assert "episodes" in refused(*options, f"--dataset.episodes={episodes}")
+    line = refused(*options, f"--dataset.episodes={episodes}")
+    assert f"episodes must be some of 0 to 4, got {json.loads(episodes)}" in line
     assert everything_in(tmp_path) == []
 
 
@@ -984,7 +1007,7 @@ def said(hub: HubServer, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
         "missing_dataset": [policy, "--dataset.repo_id=user/none"],
         "missing_dataset_revision": [policy, data, "--dataset.revision=none"],
         "untagged_dataset": [policy, "--dataset.repo_id=user/untagged"],
-        "missing_episode": [policy, data, "--dataset.episodes=[0,99]"],
+        "missing_episode": [policy, data, "--dataset.root=downloaded", "--dataset.episodes=[0,99]"],
         "broken_checkpoint": ["--policy.path=user/broken", data],
         "broken_dataset": [policy, "--dataset.repo_id=user/broken"],
     }
@@ -1017,15 +1040,15 @@ def test_a_revision_of_the_checkpoint_and_one_of_the_dataset_can_be_chosen(
 @pytest.mark.parametrize(
     ("case", "message"),
     [
-        ("missing_checkpoint", "user/none"),
-        ("missing_revision", "user/repo"),
+        ("missing_checkpoint", "user/none cannot be loaded: "),
+        ("missing_revision", "user/repo at revision .* cannot be loaded: "),
         ("missing_dataset", "Not Found.*user/none"),
         ("missing_dataset_revision", "Revision Not Found.*user/data/revision/none"),
         ("untagged_dataset", "must be tagged.*user/untagged"),
-        pytest.param("missing_preprocessor", "policy_preprocessor.json"),
-        pytest.param("missing_episode", "99"),
-        pytest.param("broken_checkpoint", ""),
-        pytest.param("broken_dataset", ""),
+        ("missing_preprocessor", "user/bare cannot be loaded: .*policy_preprocessor.json"),
+        ("missing_episode", r"user/data in downloaded cannot be read: .* 0 to 4, got \[0, 99\]"),
+        ("broken_checkpoint", "user/broken cannot be loaded: "),
+        ("broken_dataset", "user/broken cannot be read: "),
     ],
 )
 def test_what_is_missing_on_the_hub_is_named_in_one_line(said, case, message):
