@@ -745,7 +745,7 @@ def test_rows_of_a_policy_that_is_not_asked_for_any_more_stay(
         {"env": PF2MPMazeEnv(task=UMAZE, episode_length=7)},
         {"env": PF2MPMazeEnv(task=UMAZE, episode_length=EPISODE_LENGTH, control="pd")},
     ],
-    ids=str,
+    ids=["n_episodes", "episode_seed", "batch_size", "episode_length", "control"],
 )
 def test_other_episodes_in_the_same_folder_are_an_error(
     copied: Path, whole: Path, whole_spec: BenchmarkSpec, evaluations: list[float], change: dict[str, Any]
