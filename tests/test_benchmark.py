@@ -139,8 +139,8 @@ def rows_of(folder: Path) -> list[EpisodeRow]:
 
 
 def timeless(rows: list[EpisodeRow]) -> list[EpisodeRow]:
-    """Everything but the time, which no two runs share."""
-    return [replace(row, chunk_latency_ms=None) for row in rows]
+    """Everything but the time, which no two runs share, and the commit, which may change between them."""
+    return [replace(row, chunk_latency_ms=None, commit="") for row in rows]
 
 
 def run(spec: BenchmarkSpec, folder: Path) -> list[EpisodeRow]:
@@ -601,15 +601,15 @@ def test_results_do_not_depend_on_what_ran_before(
     assert sorted(rows, key=repr) == sorted(timeless(rows_of(whole)), key=repr)
 
 
-def test_the_same_command_gives_the_same_file_but_for_the_latency(
+def test_the_same_command_gives_the_same_file_but_for_latency_and_commit(
     whole: Path, whole_spec: BenchmarkSpec, tmp_path: Path
 ) -> None:
     torch.manual_seed(123)
     run_benchmark(whole_spec, tmp_path)
-    latency = COLUMNS.split(",").index("chunk_latency_ms")
+    others = {COLUMNS.split(",").index(name) for name in ("chunk_latency_ms", "commit")}
     first, second = (
         [
-            [field for i, field in enumerate(line.split(",")) if i != latency]
+            [field for i, field in enumerate(line.split(",")) if i not in others]
             for line in (folder / "episodes.csv").read_text().splitlines()
         ]
         for folder in (whole, tmp_path)
