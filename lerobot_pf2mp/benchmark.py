@@ -50,6 +50,7 @@ from lerobot_pf2mp.results import (
     write_rows,
 )
 from lerobot_pf2mp.tables import make_latex, make_markdown
+from lerobot_pf2mp.written_beside import file_written_beside
 
 # What a guided policy is called when guidance is off.
 UNGUIDED_NAMES = {"pf2mp": "fmp", "dppf": "dp"}
@@ -113,7 +114,7 @@ class BenchmarkSpec:
         device: Where the policies run.
 
     Raises:
-        ValueError: If a number is not positive or there is nothing to compare.
+        ValueError: If a number is not positive, there is nothing to compare, or something would be compared twice.
     """
 
     env: EnvConfig
@@ -135,6 +136,19 @@ class BenchmarkSpec:
         for name in ("tasks", "policies", "guidances", "variants", "seeds"):
             if not getattr(self, name):
                 raise ValueError(f"{name} must name at least one, got none")
+        for name in ("tasks", "guidances", "seeds"):
+            values = list(getattr(self, name))
+            if len(set(values)) < len(values):
+                raise ValueError(f"{name} must differ from each other, got {values}")
+        for policy, path in self.policies.items():
+            if len(self.seeds) > 1 and "{seed}" not in path:
+                raise ValueError(
+                    f"with several seeds the path of {policy!r} must hold {{seed}}, got {path} and the seeds {self.seeds}"
+                )
+        for variant, options in self.variants.items():
+            for option in ("guidance_scale", "guidance_integrator"):
+                if option in options:
+                    raise ValueError(f"{option} must be given as guidance, got it in the variant {variant!r}")
 
 
 @dataclass(frozen=True)
@@ -165,16 +179,21 @@ def run_benchmark(spec: BenchmarkSpec, output_dir: Path, *, n_processes: int = 1
         One row for each policy, kind of guidance and repeat.
 
     Raises:
-        ValueError: If `output_dir` holds a benchmark with other episodes.
+        ValueError: If `output_dir` holds a benchmark with other episodes, or of other policies with the same names.
         FileNotFoundError: If a checkpoint does not exist.
     """
     if n_processes < 1:
         raise ValueError(f"n_processes must be at least 1, got {n_processes}")
     jobs = _make_jobs(spec)
     output_dir.mkdir(parents=True, exist_ok=True)
-    _claim(output_dir, spec)
     episodes = output_dir / "episodes.csv"
-    done = _keep_whole_repeats(episodes, spec.n_episodes)
+    rows = read_rows(episodes, EpisodeRow) if episodes.exists() else []
+    _refuse_other_checkpoints(rows, jobs, output_dir)
+    _claim(output_dir, spec)
+    # Repeats that a kill has cut short are made anew.
+    counts = Counter(map(_identify, rows))
+    done = {key for key, count in counts.items() if count == spec.n_episodes}
+    write_rows(episodes, [row for row in rows if _identify(row) in done], EpisodeRow)
     missing = [job for job in jobs if _identify(job) not in done]
     with (
         episodes.open("a", newline="", encoding="utf-8") as file,
@@ -187,8 +206,9 @@ def run_benchmark(spec: BenchmarkSpec, output_dir: Path, *, n_processes: int = 1
     summary = summarise(read_rows(episodes, EpisodeRow))
     write_rows(output_dir / "summary.csv", summary, SummaryRow)
     cells = group_cells(summary)
-    (output_dir / "table.md").write_text(make_markdown(cells), encoding="utf-8")
-    (output_dir / "table.tex").write_text(make_latex(cells), encoding="utf-8")
+    for name, make_table in (("table.md", make_markdown), ("table.tex", make_latex)):
+        with file_written_beside(output_dir / name) as partial:
+            partial.write_text(make_table(cells), encoding="utf-8")
     return summary
 
 
@@ -199,7 +219,9 @@ def _make_jobs(spec: BenchmarkSpec) -> list[_Job]:
         for name, template in spec.policies.items():
             for seed in spec.seeds:
                 checkpoint = template.replace("{task}", task).replace("{seed}", str(seed))
-                is_guided = isinstance(load_config(checkpoint), GuidedConfig)
+                # Options that do not exist are an error now rather than in the middle.
+                configs = [load_config(checkpoint, **options) for options in spec.variants.values()]
+                is_guided = isinstance(configs[0], GuidedConfig)
                 guidances = spec.guidances if is_guided else (NONE,)
                 jobs += [
                     _Job(
@@ -232,6 +254,18 @@ def _identify(row: _Job | EpisodeRow) -> tuple[object, ...]:
     else:
         guidance = row.guidance_integrator, row.guidance_scale
     return row.task, row.policy, row.checkpoint, *guidance, row.variant, row.seed, row.repeat
+
+
+def _refuse_other_checkpoints(rows: Sequence[EpisodeRow], jobs: Sequence[_Job], output_dir: Path) -> None:
+    """Rows of two checkpoints under one name would be counted together."""
+    found = {(row.task, row.policy, row.seed): row.checkpoint for row in rows}
+    for job in jobs:
+        checkpoint = found.get((job.task, job.policy, job.seed), job.checkpoint)
+        if checkpoint != job.checkpoint:
+            raise ValueError(
+                f"{output_dir} holds results of {job.policy!r} from {checkpoint}, got {job.checkpoint}: choose another "
+                "name or another --output_dir"
+            )
 
 
 def _claim(output_dir: Path, spec: BenchmarkSpec) -> None:
@@ -272,21 +306,13 @@ def _claim(output_dir: Path, spec: BenchmarkSpec) -> None:
             "machine": _describe_machine(spec.device),
         },
     }
-    mark.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    with file_written_beside(mark) as partial:
+        partial.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
 def _describe_machine(device: str) -> str:
     cpu = f"{platform.machine()}, {os.cpu_count()} cores"
     return f"{cpu}, {torch.cuda.get_device_name(device)}" if device.startswith("cuda") else cpu
-
-
-def _keep_whole_repeats(path: Path, n_episodes: int) -> set[tuple[object, ...]]:
-    """Removes repeats that a kill has cut short from the file, and returns what is whole."""
-    rows = read_rows(path, EpisodeRow) if path.exists() else []
-    counts = Counter(map(_identify, rows))
-    whole = {key for key, count in counts.items() if count == n_episodes}
-    write_rows(path, [row for row in rows if _identify(row) in whole], EpisodeRow)
-    return whole
 
 
 def _evaluate_all(spec: BenchmarkSpec, jobs: Sequence[_Job], n_processes: int) -> Iterator[list[EpisodeRow]]:

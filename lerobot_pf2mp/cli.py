@@ -470,6 +470,7 @@ def _run(config_class: type, main: Callable[[Any], None]) -> None:
         ValueError,
         RuntimeError,
         OSError,
+        ImportError,
     ) as error:
         print("error:", " ".join(str(error).split()), file=sys.stderr)
         sys.exit(1)

@@ -3,11 +3,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+
+# What an environment's info may hold, and what of it stands for a whole episode.
+_OVER_STEPS: dict[str, Callable[[float, float], float]] = {
+    "is_collision": max,
+    "clearance": min,
+    "path_length": max,
+}
 
 
 @dataclass(frozen=True)
@@ -15,7 +23,7 @@ class Episode:
     """What happened in one episode. Numbers that the environment does not report are None.
 
     Args:
-        collision: Whether there was a collision (``is_collision`` in the environment's info).
+        collision: Whether there was a collision (``is_collision`` of any step in the environment's info).
         min_clearance: Smallest ``clearance`` of all steps [m].
         path_length: ``path_length`` at the end [m].
         steps: Control steps.
@@ -73,7 +81,7 @@ class EpisodeRecorder(gym.vector.VectorWrapper):
         return episodes
 
     def _note(self, info: dict[str, Any]) -> None:
-        for key in ("is_collision", "clearance", "path_length"):
+        for key, combine in _OVER_STEPS.items():
             values = info.get(key)
             if values is None:
                 continue
@@ -81,7 +89,7 @@ class EpisodeRecorder(gym.vector.VectorWrapper):
             for i in np.flatnonzero(is_given & ~self._ended):
                 reported = self._reported[i]
                 value = float(values[i])
-                reported[key] = min(value, reported.get(key, value)) if key == "clearance" else value
+                reported[key] = combine(reported.get(key, value), value)
 
     def _finish(self) -> None:
         if not self._steps.any():

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -36,12 +37,14 @@ def load_policy(
     Raises:
         FileNotFoundError: If the path is neither a folder nor the name of a repository.
         OSError: If the checkpoint cannot be read or reached.
+        ValueError: If there is no such field, or it cannot have that value.
     """
     config = load_config(path, revision=revision, device=device, **overrides)
+    path = str(config.pretrained_path)
     policy = get_policy_class(config.type).from_pretrained(path, config=config, revision=revision)
     preprocessor, postprocessor = make_pre_post_processors(
         config,
-        pretrained_path=str(path),
+        pretrained_path=path,
         pretrained_revision=revision,
         preprocessor_overrides={"device_processor": {"device": config.device}},
     )
@@ -52,8 +55,9 @@ def load_config(
     path: str | Path, *, revision: str | None = None, device: str | None = None, **overrides: Any
 ) -> PreTrainedConfig:
     """Loads a checkpoint's configuration; the arguments and errors are those of `load_policy`."""
-    is_repository_name = len(Path(path).parts) == 2 and not Path(path).is_absolute()
-    if not Path(path).is_dir() and not is_repository_name:
+    path = Path(path).expanduser()
+    is_repository_name = len(path.parts) == 2 and not path.is_absolute()
+    if not path.is_dir() and not is_repository_name:
         raise FileNotFoundError(
             f"path must be a checkpoint's pretrained_model folder or a repository user/name, got {path}"
         )
@@ -65,7 +69,13 @@ def load_config(
     ]
     at_revision = f" at revision {revision}" if revision else ""
     with explained(f"the checkpoint {path}{at_revision} cannot be loaded"):
-        config = PreTrainedConfig.from_pretrained(path, revision=revision, cli_overrides=options)
+        config = PreTrainedConfig.from_pretrained(path, revision=revision)
+        names = [field.name for field in fields(config)]
+        for name in overrides:
+            if name not in names:
+                raise ValueError(f"a {config.type} policy's option must be one of {names}, got {name!r}")
+        if options:
+            config = PreTrainedConfig.from_pretrained(path, revision=revision, cli_overrides=options)
     # LeRobot leaves this empty; without it the processors would be built anew, with neither statistics nor field.
-    config.pretrained_path = Path(path)
+    config.pretrained_path = path
     return config

@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from lerobot_pf2mp.potential_field import PotentialField
 from lerobot_pf2mp.results import NO_GUIDANCE, Cell
+from lerobot_pf2mp.written_beside import file_written_beside
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -329,9 +330,7 @@ def animate_flow(
         n_between = max(1, round(30 / n_steps))
         times = [*np.linspace(0, n_steps, n_steps * n_between + 1), *[n_steps] * 15]
         times = [0.0] * 6 + times  # time to look at the noise and at the result
-        output.parent.mkdir(parents=True, exist_ok=True)
-        partial = output.with_name(f".{output.name}.partial.gif")
-        with writer.saving(figure, str(partial), dpi=80):
+        with file_written_beside(output) as partial, writer.saving(figure, str(partial), dpi=80):
             for time in tqdm(times, desc="Flow", unit="frame"):
                 for axis, name, steps, dots in panels:
                     step = min(int(time), n_steps - 1)
@@ -342,7 +341,6 @@ def animate_flow(
                         dot.set_linewidth(1.5 * (time / n_steps) ** 6)
                     axis.set_title(f"{name}, t = {time / n_steps:.2f}", fontsize=11)
                 writer.grab_frame()
-        partial.replace(output)
 
 
 @contextmanager
@@ -371,10 +369,8 @@ def _figure(
         try:
             yield figure
             if output is not None:
-                output.parent.mkdir(parents=True, exist_ok=True)
-                partial = output.with_name(f".{output.name}.partial")
-                figure.savefig(partial, dpi=_DPI, format="png")
-                partial.replace(output)
+                with file_written_beside(output) as partial:
+                    figure.savefig(partial, dpi=_DPI)
         finally:
             plt.close(figure)
 

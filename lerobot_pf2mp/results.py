@@ -13,6 +13,7 @@ from pathlib import Path
 from scipy.stats import binomtest
 
 from lerobot_pf2mp.rate import Rate
+from lerobot_pf2mp.written_beside import file_written_beside
 
 NO_GUIDANCE = "none"
 
@@ -195,8 +196,8 @@ class Cell:
         """How many of all episodes reach the goal."""
         return Rate(sum(row.successes for row in self.repeats), self.n_episodes)
 
-    def deviation(self, count: str, over: str) -> float:
-        """Standard deviation of a rate over repeats or training seeds; 0 if there is only one.
+    def deviation(self, count: str, over: str) -> float | None:
+        """Standard deviation of a rate over repeats or training seeds; None if there is only one.
 
         Args:
             count: collisions or successes.
@@ -209,7 +210,7 @@ class Cell:
             sum(getattr(row, count) or 0 for row in rows) / sum(row.n_episodes for row in rows)
             for rows in groups.values()
         ]
-        return statistics.stdev(rates) if len(rates) > 1 else 0.0
+        return statistics.stdev(rates) if len(rates) > 1 else None
 
     @property
     def mcnemar_p(self) -> float | None:
@@ -237,13 +238,10 @@ def group_cells(rows: Iterable[SummaryRow]) -> list[Cell]:
 
 def write_rows(path: Path, rows: Sequence[EpisodeRow] | Sequence[SummaryRow], row_type: type) -> None:
     """Writes rows as CSV; the file appears whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.partial")
-    with partial.open("w", newline="", encoding="utf-8") as file:
+    with file_written_beside(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(field.name for field in dataclasses.fields(row_type))
         writer.writerows(format_row(row) for row in rows)
-    partial.replace(path)
 
 
 def format_row(row: EpisodeRow | SummaryRow) -> list[str]:

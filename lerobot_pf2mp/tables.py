@@ -25,7 +25,7 @@ _COLUMNS = (
 def make_markdown(cells: Sequence[Cell]) -> str:
     """A Markdown table, one row for each cell.
 
-    Rates are means, with the standard deviation over repeats and, with several training seeds, over those too. The 95 %
+    Rates are means, with the standard deviation over repeats and over training seeds if there are several. The 95 %
     interval is Wilson's over all episodes, p that of McNemar's exact test against the same weights without guidance.
     """
     columns, rows = _rows(cells)
@@ -57,8 +57,6 @@ def _rows(cells: Sequence[Cell]) -> tuple[list[str], list[list[str]]]:
 def _row(cell: Cell, has_variants: bool) -> list[str]:
     first = cell.repeats[0]
     collision = cell.collision
-    n_repeats = len({row.repeat for row in cell.repeats})
-    n_episodes = cell.n_episodes // len(cell.repeats)
     p = cell.mcnemar_p
     return [
         first.task,
@@ -70,13 +68,30 @@ def _row(cell: Cell, has_variants: bool) -> list[str]:
         "" if collision is None else "{:.2f} to {:.2f}".format(*(100 * end for end in collision.interval)),
         "" if p is None else _p_value(p),
         _rate(cell, cell.success, "successes"),
-        " x ".join(map(str, [*([cell.n_seeds] if cell.n_seeds > 1 else []), n_repeats, n_episodes])),
+        _episodes(cell),
     ]
 
 
 def _rate(cell: Cell, rate: Rate, count: str) -> str:
-    text = f"{100 * rate.value:.2f} ± {100 * cell.deviation(count, 'repeat'):.2f}"
-    return f"{text} (seeds ± {100 * cell.deviation(count, 'seed'):.2f})" if cell.n_seeds > 1 else text
+    text = f"{100 * rate.value:.2f}"
+    over_repeats, over_seeds = cell.deviation(count, "repeat"), cell.deviation(count, "seed")
+    if over_repeats is not None:
+        text += f" ± {100 * over_repeats:.2f}"
+    if over_seeds is not None:
+        text += f" (seeds ± {100 * over_seeds:.2f})"
+    return text
+
+
+def _episodes(cell: Cell) -> str:
+    """Training seeds x repeats x episodes of each, or their total if some have fewer repeats than others."""
+    n_repeats = len({row.repeat for row in cell.repeats})
+    n_each = cell.repeats[0].n_episodes
+    if cell.n_seeds * n_repeats * n_each != cell.n_episodes:
+        return str(cell.n_episodes)
+    counts = [cell.n_seeds, n_repeats, n_each]
+    while counts[0] == 1 < len(counts):
+        del counts[0]
+    return " x ".join(map(str, counts))
 
 
 def _p_value(p: float) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes folders that appear whole or not at all."""
+"""Writes files and folders that appear whole or not at all."""
 
 from __future__ import annotations
 
@@ -8,6 +8,25 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+
+@contextmanager
+def file_written_beside(path: Path) -> Iterator[Path]:
+    """A temporary file beside `path` that takes its place at the end, and vanishes if anything goes wrong.
+
+    Args:
+        path: The file to be written or replaced; folders on the way to it are made.
+
+    Yields:
+        The path of the temporary file, which has the same ending and does not exist yet.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".partial.{path.name}")
+    try:
+        yield partial
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -248,6 +248,46 @@ def test_nothing_to_compare_is_refused(name: str, empty: Any) -> None:
         replace(spec_of({"pf2mp": "somewhere"}), **{name: empty})
 
 
+@pytest.mark.parametrize(
+    ("name", "values"), [("tasks", (UMAZE, UMAZE)), ("guidances", (NONE, NONE)), ("seeds", (3, 4, 3))]
+)
+def test_what_is_named_twice_is_refused(name: str, values: tuple) -> None:
+    with pytest.raises(ValueError, match=f"{name} must differ from each other, got "):
+        replace(spec_of({"pf2mp": "somewhere_{seed}"}), **{name: values})
+
+
+def test_several_training_seeds_of_one_checkpoint_are_refused() -> None:
+    with pytest.raises(
+        ValueError, match=r"the path of 'act' must hold \{seed\}, got somewhere and the seeds"
+    ):
+        spec_of({"pf2mp": "somewhere_{seed}", "act": "somewhere"}, seeds=(0, 1))
+
+
+@pytest.mark.parametrize("option", ["guidance_scale", "guidance_integrator"])
+def test_guidance_is_not_changed_by_a_variant(option: str) -> None:
+    with pytest.raises(
+        ValueError, match=f"{option} must be given as guidance, got it in the variant 'strong'"
+    ):
+        spec_of({"pf2mp": "somewhere"}, variants={"": {}, "strong": {option: 8.0}})
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"steps": 1}, r"a pf2mp policy's option must be one of \[.*'num_inference_steps'.*\], got 'steps'"),
+        ({"num_inference_steps": 0}, "num_inference_steps must be at least 1, got 0"),
+        ({"num_inference_steps": "many"}, "`num_inference_steps`: Couldn't parse 'many' into an int"),
+    ],
+)
+def test_an_option_that_cannot_be_is_an_error_before_anything_is_written(
+    checkpoints: dict[str, str], tmp_path: Path, options: dict[str, Any], message: str
+) -> None:
+    spec = spec_of({"pf2mp": checkpoints["pf2mp"]}, variants={"": {}, "other": options})
+    with pytest.raises(ValueError, match=message):
+        run_benchmark(spec, tmp_path / "benchmark")
+    assert not list(tmp_path.iterdir())
+
+
 def test_less_than_one_process_is_refused(checkpoints: dict[str, str], tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="n_processes must be at least 1, got 0"):
         run_benchmark(spec_of(checkpoints), tmp_path / "benchmark", n_processes=0)
@@ -759,6 +799,23 @@ def test_other_episodes_in_the_same_folder_are_an_error(
         assert (copied / path.name).read_bytes() == path.read_bytes()
 
 
+def test_another_checkpoint_of_the_same_name_in_the_same_folder_is_an_error(
+    checkpoints: dict[str, str],
+    copied: Path,
+    whole: Path,
+    whole_spec: BenchmarkSpec,
+    evaluations: list[float],
+    tmp_path: Path,
+) -> None:
+    other = shutil.copytree(checkpoints["pf2mp"], tmp_path / "other")
+    message = f"holds results of 'fmp' from {checkpoints['pf2mp']}, got {other}: choose another name"
+    with pytest.raises(ValueError, match=re.escape(message)):
+        run_benchmark(replace(whole_spec, policies={"pf2mp": str(other)}, variants={"new": {}}), copied)
+    assert evaluations == []
+    for path in whole.iterdir():
+        assert (copied / path.name).read_bytes() == path.read_bytes()
+
+
 def test_another_meaning_of_a_variant_in_the_same_folder_is_an_error(
     checkpoints: dict[str, str], tmp_path: Path
 ) -> None:
@@ -791,6 +848,15 @@ def test_another_task_of_the_same_environment_is_added(
 
 
 # Loading
+
+
+def test_checkpoints_below_the_home_folder_are_found(
+    checkpoints: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(Path(checkpoints["pf2mp"]).parent))
+    rows = run(spec_of({"pf2mp": "~/pf2mp"}, "proximal:0.8"), tmp_path)
+    assert outcomes(rows, "pf2mp")
+    assert {row.checkpoint for row in rows} == {"~/pf2mp"}
 
 
 def test_loading_refuses_what_is_neither_folder_nor_repository(

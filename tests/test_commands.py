@@ -345,9 +345,9 @@ def test_benchmark_compares_policies_and_prints_the_table(
 ) -> None:
     for seed in (1, 2):
         write_checkpoint(tmp_path / f"policy_{seed}", "pf2mp", seed)
-    act = write_checkpoint(tmp_path / "act", "act")
+        write_checkpoint(tmp_path / f"act_{seed}", "act", seed)
     options = (
-        f"--policies={{pf2mp: '{tmp_path}/policy_{{seed}}', act: {act}}}",
+        f"--policies={{pf2mp: '{tmp_path}/policy_{{seed}}', act: '{tmp_path}/act_{{seed}}'}}",
         '--guidance=[none, "proximal:0.08,0.8"]',
         '--variants={"": {}, one step: {}}',
         "--seeds=[1, 2]",
@@ -368,10 +368,10 @@ def test_benchmark_compares_policies_and_prints_the_table(
         )
         for guidance in kinds
         for variant in ("", "one step")
-    ] or table
+    ]
     rows = read_rows(tmp_path / "new/benchmark/episodes.csv", EpisodeRow)
     assert len(rows) == (3 + 1) * 2 * 2 * 2
-    assert {row.checkpoint for row in rows if row.seed == 2} == {f"{tmp_path}/policy_2", act}
+    assert {row.checkpoint for row in rows if row.seed == 2} == {f"{tmp_path}/policy_2", f"{tmp_path}/act_2"}
 
 
 @pytest.mark.slow
@@ -408,6 +408,10 @@ def test_help_of_benchmark_shows_examples_and_defaults(
         (["--n_processes=0"], "error: n_processes must be at least 1, got 0"),
         (["--seeds=[]"], "error: seeds must name at least one, got none"),
         (["--seeds=[first]"], "error: `seeds"),
+        (["--seeds=[0, 0]"], "error: seeds must differ from each other, got [0, 0]"),
+        (["--seeds=[0, 1]"], "error: with several seeds the path of 'fmp' must hold {seed}"),
+        (["--variants={fast: {steps: 1}}"], "error: the checkpoint "),
+        (["--variants={strong: {guidance_scale: 8}}"], "error: guidance_scale must be given as guidance"),
         (["--env.task=MazeHuge-v0"], "error: task must be one of"),
     ],
 )

@@ -88,6 +88,14 @@ def test_an_episode_counts_from_its_reset_to_its_last_step_and_no_further(frozen
     ]
 
 
+def test_a_collision_that_is_reported_in_its_own_step_only_still_counts() -> None:
+    walk = Walk([0.5, -0.1, 0.5])
+    walk._info = lambda: {"is_collision": walk._clearances[walk._step] < 0}
+    recorder = recorder_of(walk)
+    roll_out(recorder, 2)
+    assert recorder.take_episodes(1) == [Episode(True, None, None, steps=2)]
+
+
 def test_what_follows_the_end_of_an_episode_does_not_count() -> None:
     # Not frozen: the first walk has ended after one step and begins again, closer to the wall at every later step.
     walk = Walk([0.7, 0.6])

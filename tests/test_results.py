@@ -340,7 +340,7 @@ def test_deviations_are_over_repeats_or_over_training_seeds_the_other_being_aver
     assert both.deviation("successes", "repeat") == pytest.approx(0.16 / math.sqrt(2))
     assert both.deviation("successes", "seed") == pytest.approx(0.40 / math.sqrt(2))
     one = cell(repeats[0])
-    assert [one.deviation("collisions", over) for over in ("repeat", "seed")] == [0.0, 0.0]
+    assert [one.deviation("collisions", over) for over in ("repeat", "seed")] == [None, None]
 
 
 def test_cells_are_grouped_by_all_but_seed_and_repeat_in_the_order_of_appearance() -> None:
@@ -409,6 +409,23 @@ def test_markdown_shows_the_deviation_over_training_seeds_if_there_are_several()
 
 
 @pytest.mark.parametrize(
+    ("repeats", "text"),
+    [
+        ([(3, 0)], "50"),
+        ([(3, 0), (3, 1)], "2 x 50"),
+        ([(3, 0), (5, 0)], "2 x 1 x 50"),
+        ([(3, 0), (3, 1), (5, 0), (5, 1)], "2 x 2 x 50"),
+        ([(3, 0), (3, 1), (5, 0)], "150"),  # a repeat is missing
+    ],
+)
+def test_episodes_are_training_seeds_times_repeats_times_pairs(
+    repeats: list[tuple[int, int]], text: str
+) -> None:
+    row = markdown_rows(cell(*({"seed": seed, "repeat": repeat} for seed, repeat in repeats)))[-1]
+    assert row.endswith(f"| {text} |")
+
+
+@pytest.mark.parametrize(
     ("n_fixed", "text"), [(5, "0.062"), (14, "0.00012"), (15, "< 1e-4"), (400, "< 1e-4"), (0, "1")]
 )
 def test_small_p_values_are_cut_off(n_fixed: int, text: str) -> None:
@@ -418,30 +435,31 @@ def test_small_p_values_are_cut_off(n_fixed: int, text: str) -> None:
 
 def test_what_an_environment_does_not_report_is_left_empty() -> None:
     row = markdown_rows(cell({"collisions": None}))[-1]
-    assert row == "| MazeLarge-v0 | pf2mp | proximal | 0.8 |  |  |  | 98.00 ± 0.00 | 1 x 50 |"
+    assert row == "| MazeLarge-v0 | pf2mp | proximal | 0.8 |  |  |  | 98.00 | 50 |"
 
 
 def test_there_is_a_column_of_variants_only_if_there_are_any() -> None:
     wide = cell({"variant": "wide"})
     head, plain_row, wide_row = markdown_rows(cell({}), wide)
     assert "| lambda | variant | collision rate [%] |" in head
-    assert "| 0.8 |  | 2.00 ± 0.00 |" in plain_row
-    assert "| 0.8 | wide | 2.00 ± 0.00 |" in wide_row
+    assert "| 0.8 |  | 2.00 |" in plain_row
+    assert "| 0.8 | wide | 2.00 |" in wide_row
     assert "variant" not in markdown_rows(cell({}))[0]
     assert make_latex([cell({}), wide]).startswith(r"\begin{tabular}{llllllllll}")
 
 
 def test_latex_is_the_same_table_with_the_rules_of_booktabs() -> None:
     pairs = {"only_unguided_collides": 30, "only_guided_collides": 0}
-    table = make_latex([cell({"task": "maze_large", "collisions": 1, **pairs})])
+    repeats = [{"task": "maze_large", "repeat": repeat, "collisions": 1, **pairs} for repeat in (0, 1)]
+    table = make_latex([cell(*repeats)])
     assert table.splitlines() == [
         r"\begin{tabular}{lllllllll}",
         r"\toprule",
         r"task & policy & guidance & $\lambda$ & collision rate [\%] & 95 \% interval & p (McNemar) & success rate [\%] "
         r"& episodes \\",
         r"\midrule",
-        r"maze\_large & pf2mp & proximal & 0.8 & 2.00 $\pm$ 0.00 & 0.35 to 10.50 & $<$ 1e-4 & 98.00 $\pm$ 0.00 "
-        r"& 1 $\times$ 50 \\",
+        r"maze\_large & pf2mp & proximal & 0.8 & 2.00 $\pm$ 0.00 & 0.55 to 7.00 & $<$ 1e-4 & 98.00 $\pm$ 0.00 "
+        r"& 2 $\times$ 50 \\",
         r"\bottomrule",
         r"\end{tabular}",
     ]
