@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,10 @@ import pytest
 from lerobot.datasets import LeRobotDataset
 from test_benchmark import write_checkpoint
 from test_convert import FOREIGN_LAYOUT, demonstrations, line, write_d4rl, write_pointmaze
+from test_results import SUMMARY, UNGUIDED
 
 from lerobot_pf2mp import cli
-from lerobot_pf2mp.results import EpisodeRow, read_rows
+from lerobot_pf2mp.results import EpisodeRow, SummaryRow, read_rows, write_rows
 
 BIN = Path(sys.executable).parent
 SECONDS = 120
@@ -111,6 +113,16 @@ def test_unknown_options_end_with_the_usage_and_nothing_written(tmp_path: Path) 
             ],
         ),
         ("pf2mp-convert", [*MAZES, "by default local/TASK", "(default: 80)"]),
+        (
+            "pf2mp-plot",
+            [
+                "lambda, density, arrows, trajectories, overview or flow",
+                "collision and success rate against lambda",
+                "PNG, or GIF for flow",
+                "light or dark",
+                "(default: 100000)",
+            ],
+        ),
         (
             "pf2mp-fit-field",
             [
@@ -361,13 +373,16 @@ def test_benchmark_compares_policies_and_prints_the_table(
     assert output.endswith(f"{table}\nWrote {tmp_path / 'new' / 'benchmark'}.\n")
     assert [tuple(row.split(" | ")[1:5]) for row in table.splitlines()[2:]] == [
         (policy, *guidance, variant)
-        for policy, kinds in (
-            ("fmp", [("none", "")]),
-            ("pf2mp", [("proximal", "0.08"), ("proximal", "0.8")]),
-            ("act", [("none", "")]),
+        for rows in (
+            [
+                ("fmp", ("none", "")),
+                ("pf2mp", ("proximal", "0.08")),
+                ("pf2mp", ("proximal", "0.8")),
+            ],
+            [("act", ("none", ""))],
         )
-        for guidance in kinds
         for variant in ("", "one step")
+        for policy, guidance in rows
     ]
     rows = read_rows(tmp_path / "new/benchmark/episodes.csv", EpisodeRow)
     assert len(rows) == (3 + 1) * 2 * 2 * 2
@@ -423,4 +438,92 @@ def test_bad_values_for_benchmark_end_in_one_line_and_nothing_written(
     before = everything_in(tmp_path)
     given = (*BENCHMARK_SMALL, f"--policies={{fmp: {policy}}}", "--output_dir=out", *options)
     assert refused(cli.benchmark, *given).startswith(message)
+    assert everything_in(tmp_path) == before
+
+
+# pf2mp-plot
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Path:
+    rows = [replace(SUMMARY, **UNGUIDED), SUMMARY, replace(SUMMARY, guidance_scale=8.0)]
+    write_rows(tmp_path / "results/summary.csv", rows, SummaryRow)
+    return tmp_path / "results"
+
+
+def run_plot(monkeypatch: pytest.MonkeyPatch, *options: str) -> None:
+    monkeypatch.setattr(sys, "argv", ["pf2mp-plot", *options])
+    cli.plot()
+
+
+@pytest.mark.slow
+def test_plot_draws_from_results(
+    tmp_path: Path, results: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "new" / "lambda.png"
+    run_plot(monkeypatch, "--figure=lambda", f"--results=[{results}]", f"--output={output}")
+    assert capsys.readouterr().out.endswith(f"Wrote {output}.\n")
+    assert output.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("figure", ["density", "arrows", "trajectories", "overview", "flow"])
+def test_plot_draws_from_a_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], figure: str
+) -> None:
+    policy = write_checkpoint(tmp_path / "policy", "pf2mp")
+    output = tmp_path / f"{figure}.{'gif' if figure == 'flow' else 'png'}"
+    run_plot(
+        monkeypatch,
+        f"--figure={figure}",
+        f"--checkpoint={policy}",
+        "--env.type=pf2mp_maze",
+        "--env.task=MazeUMaze-v0",
+        "--env.episode_length=2",
+        "--n_episodes=1",
+        "--episodes=[1]",
+        "--options={guidance_scale: 0.4}",
+        "--background=dark",
+        f"--output={output}",
+    )
+    assert capsys.readouterr().out.endswith(f"Wrote {output}.\n")
+    assert output.read_bytes().startswith(b"GIF89a" if figure == "flow" else b"\x89PNG")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--figure=pie"], "error: --figure must be one of ('lambda', 'density', 'arrows', "),
+        (["--background=blue"], "error: --background must be one of ('light', 'dark'), got 'blue'"),
+        (["--n_episodes=0"], "error: --n_episodes must be at least 1 and --episodes at least 0, got 0 and []"),
+        (["--episodes=[-1]"], "error: --n_episodes must be at least 1 and --episodes at least 0, got 6 and [-1]"),
+        (["--episodes=first"], "error: `episodes`"),
+        (["--output="], "error: --output must "),
+        (["--output=figure.jpg"], "error: --output must end in .png for this figure, got figure.jpg"),
+        (["--figure=flow"], "error: --output must end in .gif for this figure, got figure.png"),
+        (["--figure=lambda"], "error: --results must name folders written by pf2mp-benchmark, got none"),
+        (["--figure=lambda", "--results=[nowhere]"], "error: "),
+        (["--figure=lambda", "--results=[results]", "--task=MazeHuge-v0"], "error: results must be of one task"),
+        (["--checkpoint=nowhere"], "error: path must be a checkpoint's pretrained_model folder or a repository"),
+        (["--checkpoint=fmp"], "error: the checkpoint must be of type pf2mp or dppf, got 'fmp'"),
+        (["--options={guidance_scale: -1}"], "error: the checkpoint pf2mp cannot be loaded: guidance_scale must"),
+        (["--options={scale: 1}"], "error: the checkpoint pf2mp cannot be loaded: a pf2mp policy's option must be"),
+        (["--env.task=MazeHuge-v0"], "error: task must be one of"),
+    ],
+)  # fmt: skip
+def test_bad_values_for_plot_end_in_one_line_and_nothing_written(
+    tmp_path: Path,
+    results: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    refused: Callable[..., str],
+    options: list[str],
+    message: str,
+) -> None:
+    for kind in ("pf2mp", "fmp"):
+        write_checkpoint(tmp_path / kind, kind)
+    monkeypatch.chdir(tmp_path)
+    before = everything_in(tmp_path)
+    given = ("--figure=density", "--checkpoint=pf2mp", "--env.type=pf2mp_maze", "--output=figure.png")
+    assert refused(cli.plot, *given, *options).startswith(message)
     assert everything_in(tmp_path) == before
