@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The published tables are made from the published rows."""
 
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -19,10 +22,31 @@ def test_tables_are_made_from_the_rows_beside_them(folder: Path) -> None:
     assert (folder / "table.tex").read_text(encoding="utf-8") == make_latex(cells)
 
 
-def test_the_readme_shows_the_table_of_the_mazes() -> None:
-    assert (ROOT / "results/maze/table.md").read_text(encoding="utf-8") in (ROOT / "README.md").read_text(
-        encoding="utf-8"
-    )
+@pytest.mark.parametrize("page", ["README.md", "results/ABLATIONS.md"])
+def test_pages_show_the_tables_as_they_are(page: str, tmp_path: Path) -> None:
+    copy = tmp_path / "page.md"
+    shutil.copy(ROOT / page, copy)
+    subprocess.run([sys.executable, ROOT / ".ci/fill_tables", copy], check=True)
+    assert copy.read_text(encoding="utf-8") == (ROOT / page).read_text(encoding="utf-8")
+
+
+def test_every_published_table_is_on_a_page() -> None:
+    pages = [(ROOT / page).read_text(encoding="utf-8") for page in ("README.md", "results/ABLATIONS.md")]
+    for folder in RESULTS:
+        if folder.name != "maze_lambda":  # a figure
+            assert any((folder / "table.md").read_text(encoding="utf-8") in page for page in pages)
+
+
+@pytest.mark.parametrize(
+    "config", sorted((ROOT / "eval_configs/ablations").iterdir()), ids=lambda path: path.stem
+)
+def test_every_ablation_has_its_command_beside_its_table(config: Path) -> None:
+    page = (ROOT / "results/ABLATIONS.md").read_text(encoding="utf-8")
+    command = f"pf2mp-benchmark --config_path={config.relative_to(ROOT)} --n_processes=2"
+    table = f"<!-- results/ablations/{config.stem}/table.md -->"
+    section = next(part for part in page.split("\n## ") if table in part)
+    assert command in section
+    assert f"output_dir: results/ablations/{config.stem}\n" in config.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("folder", RESULTS, ids=lambda path: path.name)
