@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from lerobot_pf2mp.rate import Rate
 from lerobot_pf2mp.results import SummaryRow, group_cells, read_rows
 from lerobot_pf2mp.tables import make_latex, make_markdown
 
@@ -20,6 +21,15 @@ def test_tables_are_made_from_the_rows_beside_them(folder: Path) -> None:
     cells = group_cells(read_rows(folder / "summary.csv", SummaryRow))
     assert (folder / "table.md").read_text(encoding="utf-8") == make_markdown(cells)
     assert (folder / "table.tex").read_text(encoding="utf-8") == make_latex(cells)
+
+
+def test_the_table_of_the_demo_is_made_from_its_rows() -> None:
+    rows = read_rows(ROOT / "results/demo/results.csv", SummaryRow)
+    lines = (ROOT / "results/demo/table.md").read_text(encoding="utf-8").splitlines()
+    for row, line in zip(rows, lines[2:], strict=True):
+        assert row.collisions is not None
+        rates = Rate(row.collisions, row.n_episodes), Rate(row.successes, row.n_episodes)
+        assert line == f"| {row.policy} | {rates[0]} | {rates[1]} | {row.n_episodes} |"
 
 
 @pytest.mark.parametrize("page", ["README.md", "results/ABLATIONS.md"])
