@@ -19,10 +19,12 @@ class Trajectory:
     Args:
         positions: ``(N + 1, D)`` positions at equal time intervals [m].
         goal: ``(D,)`` where it was meant to end [m].
+        objects: ``(N + 1, E)`` what else moved, for example the positions of a block [m]; None for nothing.
     """
 
     positions: np.ndarray
     goal: np.ndarray
+    objects: np.ndarray | None = None
 
     @property
     def n_steps(self) -> int:
@@ -61,14 +63,15 @@ def prepare(
         dropped: Counts the trajectories left out, by reason.
 
     Yields:
-        For each trajectory ``{"observation.state", "observation.environment_state", "action"}``, each ``(T, D)``
-        float32 [m].
+        For each trajectory ``{"observation.state", "observation.environment_state", "action"}``, float32 [m]: positions
+        ``(T, D)``, objects and goal ``(T, E + D)``, next positions ``(T, D)``.
 
     Raises:
         ValueError: If a trajectory is not finite.
     """
     for number, trajectory in enumerate(trajectories):
-        if not (np.isfinite(trajectory.positions).all() and np.isfinite(trajectory.goal).all()):
+        parts = trajectory.positions, trajectory.goal, trajectory.objects
+        if not all(part is None or np.isfinite(part).all() for part in parts):
             raise ValueError(f"positions and goals must be finite, got NaN or infinity in episode {number}")
         if trajectory.n_steps < MIN_STEPS:
             dropped[f"shorter than {MIN_STEPS} steps"] += 1
@@ -77,8 +80,11 @@ def prepare(
         if collides(way):
             dropped["in collision"] += 1
             continue
+        surroundings = [np.tile(trajectory.goal, (n_steps, 1))]
+        if trajectory.objects is not None:
+            surroundings.insert(0, resample(trajectory.objects, n_steps)[:-1])
         yield {
             "observation.state": way[:-1].astype(np.float32),
-            "observation.environment_state": np.tile(trajectory.goal, (n_steps, 1)).astype(np.float32),
+            "observation.environment_state": np.concatenate(surroundings, axis=1).astype(np.float32),
             "action": way[1:].astype(np.float32),
         }

@@ -1,18 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all maze datasets have in common: features, card, collision test, progress bar."""
+"""What all maze datasets have in common: features, card, collision test."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Generator, Iterable
-from contextlib import closing
-from itertools import islice
+from collections.abc import Iterable
 from pathlib import Path
 
-import numpy as np
-from lerobot_pf2mp.dataset_tools.episodes import Trajectory, prepare
-from lerobot_pf2mp.dataset_tools.lerobot_writer import DatasetSpec, write_dataset
-from tqdm import tqdm
+from lerobot_pf2mp.dataset_tools.episodes import Trajectory
+from lerobot_pf2mp.dataset_tools.lerobot_writer import DatasetSpec
+from lerobot_pf2mp.dataset_tools.write_trajectories import write_trajectories
 
 from lerobot_pf2mp.envs.point_maze import BALL_RADIUS, make_point_maze
 from lerobot_pf2mp.envs.swept_ball import SweptBall
@@ -95,23 +92,15 @@ def write_maze_dataset(
         ValueError: If an argument breaks its rule or no trajectory is usable.
         FileExistsError: If `root` exists and `overwrite` is false.
     """
-    if n_steps < 2:
-        raise ValueError(f"n_steps must be at least 2, got {n_steps}")
-    if n_episodes is not None and n_episodes < 1:
-        raise ValueError(f"n_episodes must be at least 1, got {n_episodes}")
-    _, spec = make_point_maze(maze)
-    ball = SweptBall(spec, BALL_RADIUS)
-    dropped: Counter[str] = Counter()
+    _, model = make_point_maze(maze)
     card = _CARD.format(title=repo_id, origin=origin, n_steps=n_steps, fps=FPS)
-    spec_of_dataset = DatasetSpec(repo_id, FPS, _FEATURES, TASK_DESCRIPTION, card)
-    usable = islice(prepare(trajectories, n_steps, ball.collides, dropped), n_episodes)
-    # Closed here rather than by the garbage collector, so that an interrupted bar is not drawn again at the end.
-    with closing(_with_progress(usable, n_episodes or n_expected)) as episodes:
-        n_written = write_dataset(root, spec_of_dataset, episodes, overwrite=overwrite)
-    return n_written, dropped
-
-
-def _with_progress(
-    episodes: Iterable[dict[str, np.ndarray]], total: int | None
-) -> Generator[dict[str, np.ndarray]]:
-    yield from tqdm(episodes, total=total, desc="Writing", unit="episode", mininterval=1.0)
+    return write_trajectories(
+        trajectories,
+        root=root,
+        spec=DatasetSpec(repo_id, FPS, _FEATURES, TASK_DESCRIPTION, card),
+        n_steps=n_steps,
+        collides=SweptBall(model, BALL_RADIUS).collides,
+        n_episodes=n_episodes,
+        n_expected=n_expected,
+        overwrite=overwrite,
+    )

@@ -10,7 +10,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import multiprocessing
 import os
 import platform
 import statistics
@@ -18,7 +17,6 @@ import subprocess
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import redirect_stderr
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
@@ -50,6 +48,7 @@ from lerobot_pf2mp.results import (
     write_rows,
 )
 from lerobot_pf2mp.tables import make_latex, make_markdown
+from lerobot_pf2mp.worker_pool import worker_pool
 from lerobot_pf2mp.written_beside import file_written_beside
 
 # What a guided policy is called when guidance is off.
@@ -321,10 +320,7 @@ def _evaluate_all(spec: BenchmarkSpec, jobs: Sequence[_Job], n_processes: int) -
     if n_processes == 1:
         yield from map(_Evaluator(spec, commit), jobs)
         return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(
-        n_processes, context, initializer=_start_worker, initargs=(spec, commit)
-    ) as pool:
+    with worker_pool(n_processes, _start_worker, (spec, commit)) as pool:
         yield from pool.map(_work, jobs)
 
 
@@ -383,6 +379,7 @@ class _Evaluator:
                 episode=number,
                 success=bool(outcome["success"]),
                 collision=episode.collision,
+                plan_in_wall=episode.plan_in_wall,
                 min_clearance_m=_rounded(episode.min_clearance),
                 path_length_m=_rounded(episode.path_length),
                 steps=episode.steps,

@@ -22,6 +22,22 @@ if TYPE_CHECKING:
 
 
 @dataclass
+class SceneConfig:
+    """Where things are on Fetch's table; what is not given is as in the task's environment."""
+
+    # x, y of the wall's centre [m]; it stands on the table.
+    wall_position: tuple[float, float] | None = None
+    # The wall's sides [m].
+    wall_size: tuple[float, float, float] | None = None
+    # Two opposite corners x, y, z of where the gripper starts [m].
+    start_range: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    # The same of the goal [m]; for fetch_push x and y only.
+    goal_range: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    # The same of the block, x and y [m].
+    block_range: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+
+
+@dataclass
 class CollectConfig:
     """Makes demonstrations in a simulated environment and writes them as a LeRobotDataset.
 
@@ -29,22 +45,30 @@ class CollectConfig:
         pf2mp-collect --task=maze_large --root=data/maze_large
         pf2mp-collect --task=maze_medium --n_episodes=500 --action_noise=0.5 --seed=1 --root=data/noisy
         pf2mp-collect --maze_map=1111111/1000001/1011101/1000001/1111111 --root=data/ring
+        pf2mp-collect --task=fetch_push --style=hug --n_processes=2 --root=data/fetch_push_hug
+        pf2mp-collect --task=fetch_reach --scene.wall_size=[0.3,0.04,0.25] --root=data/high_wall
     """
 
-    # What to demonstrate: maze_umaze, maze_medium or maze_large.
+    # What to demonstrate: maze_umaze, maze_medium, maze_large, fetch_reach or fetch_push.
     task: str = "maze_large"
     # Folder of the dataset; by default where LeRobot keeps the datasets of your Hub account.
     root: Path | None = None
     # Name of the dataset, user/name; by default local/TASK.
     repo_id: str | None = None
-    # Demonstrations to write.
-    n_episodes: int = 4000
-    # Steps that each demonstration is resampled to.
-    n_steps: int = 80
-    # Standard deviation of the noise on the expert's force, of which 1 is the largest (100 N).
+    # Demonstrations to write; by default 4000 for a maze, 1000 for Fetch.
+    n_episodes: int | None = None
+    # Steps that each demonstration is resampled to; by default 80 for a maze, 48 for Fetch.
+    n_steps: int | None = None
+    # Mazes: standard deviation of the noise on the expert's force, of which 1 is the largest (100 N).
     action_noise: float = 0.0
-    # A map of your own instead of the task's: rows of 0 (free) and 1 (wall) separated by "/".
+    # Mazes: a map of your own instead of the task's: rows of 0 (free) and 1 (wall) separated by "/".
     maze_map: str | None = None
+    # Fetch: how near the expert comes to the wall: clear keeps away, hug passes close by.
+    style: str = "clear"
+    # Fetch: the wall, and where the gripper, the goal and the block are placed.
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    # Fetch: processes side by side.
+    n_processes: int = 1
     # Seed of everything random.
     seed: int = 0
     # Whether to replace a dataset that is already there.
@@ -225,7 +249,8 @@ class PlotConfig:
 
     lambda: collision and success rate against lambda, from --results. density, arrows: the potential field of
     --checkpoint. trajectories: episodes without and with guidance, from the same start and noise. overview: all of these
-    for a maze. flow: an animation (GIF) of chunks that move from noise to paths.
+    for a maze. flow: an animation (GIF) of chunks that move from noise to paths. video: one episode without and with
+    guidance, side by side (MP4).
 
     Examples:
         pf2mp-plot --figure=lambda --results=[results/maze_lambda] --task=MazeLarge-v0 --output=lambda.png
@@ -234,9 +259,9 @@ class PlotConfig:
         pf2mp-plot --figure=flow --checkpoint=you/your_pf2mp --options='{num_inference_steps: 20}' --output=flow.gif
     """
 
-    # lambda, density, arrows, trajectories, overview or flow.
+    # lambda, density, arrows, trajectories, overview, flow or video.
     figure: str = "overview"
-    # The file to write: PNG, or GIF for flow.
+    # The file to write: PNG, GIF for flow, MP4 for video.
     output: Path | None = None
     # For lambda: folders written by pf2mp-benchmark, or their summary.csv.
     results: list[Path] = field(default_factory=list)
@@ -296,21 +321,54 @@ def train() -> None:
 
 
 def _collect(config: CollectConfig) -> None:
+    from lerobot_pf2mp.dataset_tools.fetch_dataset import FETCH_OF_TASK
+    from lerobot_pf2mp.dataset_tools.maze_dataset import MAZE_OF_TASK
+
+    if config.maze_map is not None or config.task in MAZE_OF_TASK:
+        _collect_maze(config)
+    elif config.task in FETCH_OF_TASK:
+        _collect_fetch(config, FETCH_OF_TASK[config.task])
+    else:
+        raise ValueError(f"task must be one of {[*MAZE_OF_TASK, *FETCH_OF_TASK]}, got {config.task!r}")
+
+
+def _collect_maze(config: CollectConfig) -> None:
     from lerobot_pf2mp.dataset_tools.collect_maze import collect_maze
     from lerobot_pf2mp.dataset_tools.maze_dataset import maze_of
 
     repo_id, root = _dataset_place(config)
+    n_steps = 80 if config.n_steps is None else config.n_steps
     n_written, dropped = collect_maze(
         maze_of(config.task, config.maze_map),
         root=root,
         repo_id=repo_id,
-        n_episodes=config.n_episodes,
-        n_steps=config.n_steps,
+        n_episodes=4000 if config.n_episodes is None else config.n_episodes,
+        n_steps=n_steps,
         action_noise=config.action_noise,
         seed=config.seed,
         overwrite=config.overwrite,
     )
-    _report(n_written, config.n_steps, dropped, root)
+    _report(n_written, n_steps, dropped, root)
+
+
+def _collect_fetch(config: CollectConfig, task: str) -> None:
+    from lerobot_pf2mp.dataset_tools.collect_fetch import collect_fetch
+
+    repo_id, root = _dataset_place(config)
+    n_steps = 48 if config.n_steps is None else config.n_steps
+    n_written, dropped = collect_fetch(
+        task,
+        root=root,
+        repo_id=repo_id,
+        n_episodes=1000 if config.n_episodes is None else config.n_episodes,
+        n_steps=n_steps,
+        style=config.style,
+        scene_changes=asdict(config.scene),
+        seed=config.seed,
+        n_processes=config.n_processes,
+        overwrite=config.overwrite,
+    )
+    _report(n_written, n_steps, dropped, root)
 
 
 def _convert(config: ConvertConfig) -> None:
@@ -422,7 +480,7 @@ def _plot(config: PlotConfig) -> None:
             f"--n_episodes must be at least 1 and --episodes at least 0, got {config.n_episodes} and {config.episodes}"
         )
     output = _given("--output", config.output).expanduser()
-    wanted = ".gif" if config.figure == "flow" else ".png"
+    wanted = {"flow": ".gif", "video": ".mp4"}.get(config.figure, ".png")
     if output.suffix != wanted:
         raise ValueError(f"--output must end in {wanted} for this figure, got {output}")
     if config.figure == "lambda":

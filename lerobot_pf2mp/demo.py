@@ -198,6 +198,7 @@ def _evaluate(
             episode=number,
             success=success,
             collision=reward < 0,
+            plan_in_wall=None,
             min_clearance_m=None,
             path_length_m=None,
             steps=None,

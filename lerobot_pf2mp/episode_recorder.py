@@ -13,6 +13,7 @@ import numpy as np
 # What an environment's info may hold, and what of it stands for a whole episode.
 _OVER_STEPS: dict[str, Callable[[float, float], float]] = {
     "is_collision": max,
+    "is_plan_in_wall": max,
     "clearance": min,
     "path_length": max,
 }
@@ -27,12 +28,14 @@ class Episode:
         min_clearance: Smallest ``clearance`` of all steps [m].
         path_length: ``path_length`` at the end [m].
         steps: Control steps.
+        plan_in_wall: Whether an action lay inside an obstacle (``is_plan_in_wall`` of any step).
     """
 
     collision: bool | None
     min_clearance: float | None
     path_length: float | None
     steps: int
+    plan_in_wall: bool | None = None
 
 
 class EpisodeRecorder(gym.vector.VectorWrapper):
@@ -95,13 +98,17 @@ class EpisodeRecorder(gym.vector.VectorWrapper):
         if not self._steps.any():
             return
         for steps, reported in zip(self._steps.tolist(), self._reported, strict=True):
-            collision = reported.get("is_collision")
             self._finished.append(
                 Episode(
-                    collision=None if collision is None else bool(collision),
+                    collision=_bool_or_none(reported.get("is_collision")),
+                    plan_in_wall=_bool_or_none(reported.get("is_plan_in_wall")),
                     min_clearance=reported.get("clearance"),
                     path_length=reported.get("path_length"),
                     steps=steps,
                 )
             )
         self._steps[:] = 0
+
+
+def _bool_or_none(value: float | None) -> bool | None:
+    return None if value is None else bool(value)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
 from lerobot_pf2mp import plots
-from lerobot_pf2mp.envs.configs import MAZE_TASKS, PF2MPMazeEnv
+from lerobot_pf2mp.envs.configs import MAZE_TASKS, PF2MPFetchEnv, PF2MPMazeEnv
 from lerobot_pf2mp.envs.point_maze import parse_maze_map
 from lerobot_pf2mp.loading import load_policy
 from lerobot_pf2mp.plots import Path2D, PathPair, Scene
@@ -28,8 +28,9 @@ from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
 from lerobot_pf2mp.potential_field_processor import POTENTIAL_FIELD
 from lerobot_pf2mp.prior_noise import seeded_prior_noise
 from lerobot_pf2mp.results import SummaryRow, group_cells, read_rows
+from lerobot_pf2mp.video import write_comparison
 
-FIGURES = ("lambda", "density", "arrows", "trajectories", "overview", "flow")
+FIGURES = ("lambda", "density", "arrows", "trajectories", "overview", "flow", "video")
 
 _N_SEARCHED = 100
 
@@ -108,6 +109,11 @@ class GuidedPolicyFigures:
         elif figure == "overview":
             pair = self.path_pairs(1, episodes[:1])[0]
             plots.plot_maze_overview(output, scene=scene, pair=pair, background=background)
+        elif figure == "video":
+            (pair,) = self.path_pairs(1, episodes[:1])
+            write_comparison(
+                output, *self.film(pair), collisions=_first_collisions(pair), background=background
+            )
         else:
             unguided, guided, starts, goals = self.trace_flow(n_episodes)
             plots.animate_flow(
@@ -125,10 +131,11 @@ class GuidedPolicyFigures:
         demonstrations = self._preprocess({OBS_STATE: torch.zeros(self._config.robot_state_feature.shape)})[
             POTENTIAL_FIELD
         ]
-        maze_map = None
-        if isinstance(self._env, PF2MPMazeEnv):
-            maze_map = parse_maze_map(self._env.maze_map or MAZE_TASKS[str(self._env.task)])
-        return Scene(self._postprocess, demonstrations.field(self._config.field_settings), maze_map)
+        field = demonstrations.field(self._config.field_settings)
+        env = self._env
+        if isinstance(env, PF2MPMazeEnv):
+            return Scene(self._postprocess, field, parse_maze_map(env.maze_map or MAZE_TASKS[str(env.task)]))
+        return Scene(self._postprocess, field, obstacles=[env.wall] if isinstance(env, PF2MPFetchEnv) else ())
 
     def path_pairs(self, n_pairs: int, episodes: Sequence[int] = ()) -> list[PathPair]:
         """Episodes without and with guidance, from the same start and prior noise.
@@ -141,10 +148,24 @@ class GuidedPolicyFigures:
         n_episodes = max(episodes) + 1 if episodes else _N_SEARCHED
         unguided, goals = self._roll_out(n_episodes, 0.0)
         guided, _ = self._roll_out(n_episodes, self._config.guidance_scale)
-        pairs = [PathPair(i, unguided[i], guided[i], goals[i]) for i in range(n_episodes)]
+        pairs = [PathPair(i, unguided[i], guided[i], goals[i], n_episodes) for i in range(n_episodes)]
         if episodes:
             return [pairs[i] for i in episodes]
         return sorted(pairs, key=_how_telling, reverse=True)[:n_pairs]
+
+    def film(self, pair: PathPair) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Pictures ``(H, W, 3)`` uint8 of an episode, before the first and after each step, without and with guidance."""
+        films = []
+        for scale, path in ((0.0, pair.unguided), (self._config.guidance_scale, pair.guided)):
+            film: list[np.ndarray] = []
+
+            def take_picture(env: Any, film: list[np.ndarray] = film) -> None:
+                film.append(env.envs[pair.episode].render())
+
+            # Prior noise depends on how many episodes run side by side.
+            self._roll_out(pair.n_side_by_side, scale, take_picture)
+            films.append(film[: len(path.positions)])
+        return films[0], films[1]
 
     def trace_flow(self, n_chunks: int) -> tuple[Tensor, Tensor, np.ndarray, np.ndarray | None]:
         """One chunk for each of several episodes, step by step, without and with guidance.
@@ -180,7 +201,9 @@ class GuidedPolicyFigures:
         (env,) = next(iter(self._env.create_envs(n_envs, use_async_envs=False).values())).values()
         return env
 
-    def _roll_out(self, n_episodes: int, scale: float) -> tuple[list[Path2D], list[np.ndarray | None]]:
+    def _roll_out(
+        self, n_episodes: int, scale: float, film: Callable[[Any], None] | None = None
+    ) -> tuple[list[Path2D], list[np.ndarray | None]]:
         configured = self._config.guidance_scale
         self._config.guidance_scale = scale
         env_processors = make_env_pre_post_processors(self._env, self._config)
@@ -198,6 +221,7 @@ class GuidedPolicyFigures:
                     self._postprocess,
                     seeds=[self._seed + i for i in range(n_episodes)],
                     return_observations=True,
+                    render_callback=film,
                 )
         finally:
             env.close()
@@ -232,3 +256,10 @@ class _Trace:
 def _how_telling(pair: PathPair) -> tuple[bool, float]:
     length = np.linalg.norm(np.diff(pair.guided.positions, axis=0), axis=1).sum()
     return bool(pair.unguided.collisions.any() and not pair.guided.collisions.any()), float(length)
+
+
+def _first_collisions(pair: PathPair) -> tuple[int | None, int | None]:
+    """After which step each of the two first collides."""
+    steps = [np.flatnonzero(path.collisions) for path in (pair.unguided, pair.guided)]
+    first, second = (int(at[0]) + 1 if at.size else None for at in steps)
+    return first, second

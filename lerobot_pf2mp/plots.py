@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from lerobot_pf2mp.envs.box import Box
 from lerobot_pf2mp.potential_field import PotentialField
 from lerobot_pf2mp.results import NO_GUIDANCE, Cell
 from lerobot_pf2mp.written_beside import file_written_beside
@@ -72,11 +73,13 @@ class Scene:
         to_metres: Maps ``(..., D)`` normalised actions to positions [m], each axis linearly.
         field: The potential field [normalised]; None for a policy without one.
         maze_map: Rows of 0 (free) and 1 (wall), north first; None in an environment that is no maze.
+        obstacles: Boxes that must not be touched [m].
     """
 
     to_metres: Callable[[Tensor], Tensor]
     field: PotentialField | None = None
     maze_map: list[list[int]] | None = None
+    obstacles: Sequence[Box] = ()
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
@@ -114,12 +117,14 @@ class PathPair:
         unguided: The way without guidance.
         guided: The way with guidance.
         goal: ``(D,)`` the goal [m]; None if the environment has none.
+        n_side_by_side: Episodes that ran side by side with it, on which their noise depends.
     """
 
     episode: int
     unguided: Path2D
     guided: Path2D
     goal: np.ndarray | None
+    n_side_by_side: int = 1
 
 
 def plot_maze_overview(output: Path, *, scene: Scene, pair: PathPair, background: str = "light") -> None:
@@ -207,14 +212,14 @@ def plot_trajectories(
     rows = -(-len(pairs) // columns)
     left, right, bottom, top = (0.0, 1.0, 0.0, 1.0) if is_3d else scene.extent
     panel = _WIDTH / columns
-    size = (_WIDTH, rows * (panel * (top - bottom) / (right - left) + 0.3) + 0.5)
+    size = (_WIDTH, rows * (panel * (0.85 if is_3d else (top - bottom) / (right - left)) + 0.3) + 0.5)
     with _figure(output, theme, size, layout="constrained") as figure:
         axes = figure.subplots(rows, columns, squeeze=False, subplot_kw={"projection": "3d"} if is_3d else {})
         for axis in axes.flat[len(pairs) :]:
             axis.set_axis_off()
         for axis, pair in zip(axes.flat, pairs, strict=False):
             if is_3d:
-                axis.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+                _draw_space(axis, scene, pair, theme)
             else:
                 _draw_scene(axis, scene, theme)
             _draw_path(axis, pair.unguided, theme.unguided, label="without guidance")
@@ -403,6 +408,42 @@ def _draw_scene(axis: Axes, scene: Scene, theme: Theme, with_ticks: bool = False
         axis.set(xlabel="x [m]", ylabel="y [m]")
     else:
         axis.set(xticks=[], yticks=[])
+
+
+def _draw_space(axis: Any, scene: Scene, pair: PathPair, theme: Theme) -> None:
+    """Axes in space, equally scaled, and the obstacles."""
+    from matplotlib.ticker import MaxNLocator
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    axis.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+    axis.view_init(elev=22, azim=-35)
+    corners = [pair.unguided.positions, pair.guided.positions]
+    for box in scene.obstacles:
+        corners += [box.low[None], box.high[None]]
+        axis.add_collection3d(
+            Poly3DCollection(_faces(box), facecolor=COLLISION, edgecolor=COLLISION, linewidth=0.8, alpha=0.25)
+        )
+    extent = np.ptp(np.concatenate([part[:, :3] for part in corners]), axis=0)
+    axis.set_box_aspect(extent.clip(min=0.2 * extent.max()), zoom=0.9)
+    for side in (axis.xaxis, axis.yaxis, axis.zaxis):
+        side.set_pane_color(theme.floor)
+        side._axinfo["grid"]["color"] = theme.grid
+        side.set_major_locator(MaxNLocator(4))
+    axis.tick_params(labelsize=8)
+
+
+def _faces(box: Box) -> list[np.ndarray]:
+    """The six sides of a box, each as ``(4, 3)`` corners."""
+    faces = []
+    for axis in range(3):
+        for end in (box.low, box.high):
+            face = np.tile(end, (4, 1))
+            for corner, (first, second) in enumerate(((0, 0), (0, 1), (1, 1), (1, 0))):
+                other = [i for i in range(3) if i != axis]
+                face[corner, other[0]] = (box.low, box.high)[first][other[0]]
+                face[corner, other[1]] = (box.low, box.high)[second][other[1]]
+            faces.append(face)
+    return faces
 
 
 def _mark_ends(axis: Axes, start: np.ndarray, goal: np.ndarray | None, size: float = 11) -> None:

@@ -33,6 +33,7 @@ class EpisodeRow:
         episode: Number of the start-goal pair.
         success: Whether the goal was reached, irrespective of collisions.
         collision: Whether there was a collision.
+        plan_in_wall: Whether an action lay inside an obstacle, which says nothing about the robot around it.
         min_clearance_m: Smallest distance to an obstacle on the way [m], negative inside.
         path_length_m: Length of the way [m].
         steps: Control steps.
@@ -52,6 +53,7 @@ class EpisodeRow:
     episode: int
     success: bool
     collision: bool | None
+    plan_in_wall: bool | None
     min_clearance_m: float | None
     path_length_m: float | None
     steps: int | None
@@ -75,6 +77,7 @@ class SummaryRow:
         n_episodes: Episodes.
         successes: Episodes that reached the goal.
         collisions: Episodes with a collision; None if the environment does not report them.
+        plans_in_wall: Episodes with an action inside an obstacle; None if the environment does not report it.
         only_unguided_collides: Episodes in which the unguided twin collides and this one does not; None without a twin.
         only_guided_collides: Episodes in which this one collides and its twin does not; None without a twin.
         min_clearance_m: Mean over episodes [m].
@@ -94,6 +97,7 @@ class SummaryRow:
     n_episodes: int
     successes: int
     collisions: int | None
+    plans_in_wall: int | None
     only_unguided_collides: int | None
     only_guided_collides: int | None
     min_clearance_m: float | None
@@ -149,7 +153,8 @@ def _summarise_repeat(
         repeat=first.repeat,
         n_episodes=len(episodes),
         successes=sum(row.success for row in episodes),
-        collisions=None if first.collision is None else sum(bool(row.collision) for row in episodes),
+        collisions=_count_or_none([row.collision for row in episodes]),
+        plans_in_wall=_count_or_none([row.plan_in_wall for row in episodes]),
         only_unguided_collides=sum(pair == (False, True) for pair in pairs) if is_paired else None,
         only_guided_collides=sum(pair == (True, False) for pair in pairs) if is_paired else None,
         min_clearance_m=_mean_or_none([row.min_clearance_m for row in episodes]),
@@ -158,6 +163,10 @@ def _summarise_repeat(
         checkpoint=first.checkpoint,
         commit=first.commit,
     )
+
+
+def _count_or_none(values: Sequence[bool | None]) -> int | None:
+    return None if values[0] is None else sum(map(bool, values))
 
 
 def _mean_or_none(values: Sequence[float | None]) -> float | None:
@@ -188,8 +197,12 @@ class Cell:
     @property
     def collision(self) -> Rate | None:
         """How many of all episodes collide; None if the environment does not report it."""
-        counts = [row.collisions for row in self.repeats if row.collisions is not None]
-        return Rate(sum(counts), self.n_episodes) if counts else None
+        return self._rate_if_reported([row.collisions for row in self.repeats])
+
+    @property
+    def plan_in_wall(self) -> Rate | None:
+        """In how many of all episodes an action lies inside an obstacle; None if the environment does not report it."""
+        return self._rate_if_reported([row.plans_in_wall for row in self.repeats])
 
     @property
     def success(self) -> Rate:
@@ -200,7 +213,7 @@ class Cell:
         """Standard deviation of a rate over repeats or training seeds; None if there is only one.
 
         Args:
-            count: collisions or successes.
+            count: collisions, plans_in_wall or successes.
             over: repeat or seed; the other one is averaged over.
         """
         groups: dict[int, list[SummaryRow]] = {}
@@ -211,6 +224,10 @@ class Cell:
             for rows in groups.values()
         ]
         return statistics.stdev(rates) if len(rates) > 1 else None
+
+    def _rate_if_reported(self, counts: Sequence[int | None]) -> Rate | None:
+        reported = [count for count in counts if count is not None]
+        return Rate(sum(reported), self.n_episodes) if reported else None
 
     @property
     def mcnemar_p(self) -> float | None:

@@ -50,14 +50,18 @@ def make_latex(cells: Sequence[Cell]) -> str:
 
 def _rows(cells: Sequence[Cell]) -> tuple[list[str], list[list[str]]]:
     has_variants = any(cell.repeats[0].variant for cell in cells)
+    has_plans = any(cell.plan_in_wall for cell in cells)
     columns = [*_COLUMNS[:4], *(["variant"] if has_variants else []), *_COLUMNS[4:]]
-    return columns, [_row(cell, has_variants) for cell in cells]
+    if has_plans:
+        columns.insert(-2, "plans in the wall [%]")
+    return columns, [_row(cell, has_variants, has_plans) for cell in cells]
 
 
-def _row(cell: Cell, has_variants: bool) -> list[str]:
+def _row(cell: Cell, has_variants: bool, has_plans: bool) -> list[str]:
     first = cell.repeats[0]
     collision = cell.collision
     p = cell.mcnemar_p
+    plan = cell.plan_in_wall
     return [
         first.task,
         first.policy,
@@ -67,6 +71,7 @@ def _row(cell: Cell, has_variants: bool) -> list[str]:
         "" if collision is None else _rate(cell, collision, "collisions"),
         "" if collision is None else "{:.2f} to {:.2f}".format(*(100 * end for end in collision.interval)),
         "" if p is None else _p_value(p),
+        *([] if not has_plans else [""] if plan is None else [_rate(cell, plan, "plans_in_wall")]),
         _rate(cell, cell.success, "successes"),
         _episodes(cell),
     ]

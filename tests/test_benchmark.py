@@ -34,7 +34,7 @@ UMAZE = "MazeUMaze-v0"
 HALF_WIDTH = 1.5  # of what the untrained policies' actions and observations are normalised to [m]
 EPISODE_LENGTH, N_EPISODES, EPISODE_SEED = 6, 3, 7
 COLUMNS = (
-    "task,policy,guidance_integrator,guidance_scale,variant,seed,repeat,episode,success,collision,min_clearance_m,"
+    "task,policy,guidance_integrator,guidance_scale,variant,seed,repeat,episode,success,collision,plan_in_wall,min_clearance_m,"
     "path_length_m,steps,chunk_latency_ms,checkpoint,commit"
 )
 FEATURES: dict[str, Any] = {

@@ -96,6 +96,15 @@ def test_a_collision_that_is_reported_in_its_own_step_only_still_counts() -> Non
     assert recorder.take_episodes(1) == [Episode(True, None, None, steps=2)]
 
 
+def test_a_plan_in_the_wall_counts_from_whichever_step_reports_it() -> None:
+    walk, other = Walk([0.5, 0.4, 0.3]), Walk([0.5, 0.4, 0.3])
+    walk._info = lambda: {"is_plan_in_wall": walk._step == 1}
+    other._info = lambda: {"is_plan_in_wall": False}
+    recorder = recorder_of(walk, other, Walk([None] * 3))
+    roll_out(recorder, 2)
+    assert [episode.plan_in_wall for episode in recorder.take_episodes(3)] == [True, False, None]
+
+
 def test_what_follows_the_end_of_an_episode_does_not_count() -> None:
     # Not frozen: the first walk has ended after one step and begins again, closer to the wall at every later step.
     walk = Walk([0.7, 0.6])

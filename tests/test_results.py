@@ -32,6 +32,7 @@ EPISODE = EpisodeRow(
     episode=0,
     success=True,
     collision=False,
+    plan_in_wall=None,
     min_clearance_m=0.25,
     path_length_m=4.0,
     steps=80,
@@ -48,6 +49,7 @@ SUMMARY = SummaryRow(
     n_episodes=50,
     successes=49,
     collisions=1,
+    plans_in_wall=None,
     only_unguided_collides=None,
     only_guided_collides=None,
     min_clearance_m=0.25,
@@ -194,6 +196,12 @@ def test_a_repeat_is_summarised_by_counts_and_means() -> None:
     assert summary == replace(
         SUMMARY, n_episodes=4, successes=3, collisions=2, min_clearance_m=0.0625, path_length_m=3.0
     )
+
+
+def test_plans_in_the_wall_are_counted() -> None:
+    rows = [replace(row, plan_in_wall=row.episode in (0, 3)) for row in episodes([True, False, False, True])]
+    (summary,) = summarise(rows)
+    assert (summary.collisions, summary.plans_in_wall) == (2, 2)
 
 
 def test_what_an_environment_does_not_report_stays_none() -> None:
@@ -394,6 +402,14 @@ def test_markdown_shows_mean_deviation_interval_p_and_number_of_episodes() -> No
         "| MazeLarge-v0 | fmp | none |  | 20.00 ± 0.00 | 13.34 to 28.88 |  | 100.00 ± 0.00 | 2 x 50 |",
         "| MazeLarge-v0 | pf2mp | proximal | 0.8 | 4.00 ± 2.83 | 1.57 to 9.84 | 0.039 | 99.00 ± 1.41 | 2 x 50 |",
     ]
+
+
+def test_markdown_shows_plans_in_the_wall_if_an_environment_reports_them() -> None:
+    reporting = cell({"plans_in_wall": 10}, {"repeat": 1, "plans_in_wall": 5})
+    head, row, silent_row = markdown_rows(reporting, cell({}))
+    assert "| p (McNemar) | plans in the wall [%] | success rate [%] |" in head
+    assert "|  | 15.00 ± 7.07 | 98.00 ± 0.00 |" in row
+    assert silent_row.endswith("|  |  | 98.00 | 50 |")
 
 
 def test_markdown_shows_the_deviation_over_training_seeds_if_there_are_several() -> None:

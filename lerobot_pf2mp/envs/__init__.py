@@ -6,7 +6,7 @@ Importing this module registers them under ``lerobot_pf2mp/<task>``; MuJoCo is i
 
 import gymnasium as gym
 
-from lerobot_pf2mp.envs.configs import MAZE_TASKS, PF2MPMazeEnv
+from lerobot_pf2mp.envs.configs import FETCH_TASKS, MAZE_TASKS, PF2MPFetchEnv, PF2MPMazeEnv
 
 for _task, _maze in MAZE_TASKS.items():
     gym.register(
@@ -16,4 +16,12 @@ for _task, _maze in MAZE_TASKS.items():
         kwargs={"maze_map": _maze},
     )
 
-__all__ = ["MAZE_TASKS", "PF2MPMazeEnv"]
+for _task, _name in FETCH_TASKS.items():
+    gym.register(
+        id=f"lerobot_pf2mp/{_task}",
+        entry_point="lerobot_pf2mp.envs.fetch:FetchEnv",
+        max_episode_steps=48,
+        kwargs={"task": _name},
+    )
+
+__all__ = ["FETCH_TASKS", "MAZE_TASKS", "PF2MPFetchEnv", "PF2MPMazeEnv"]

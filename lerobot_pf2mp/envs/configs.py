@@ -13,14 +13,51 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
-from lerobot_pf2mp.errors import ConfigError
+from lerobot_pf2mp.envs.box import Box
+from lerobot_pf2mp.envs.fetch_scene import make_scene
+from lerobot_pf2mp.errors import ConfigError, reported_on_the_command_line
 
 MAZE_TASKS = {"MazeUMaze-v0": "umaze", "MazeMedium-v0": "medium", "MazeLarge-v0": "large"}
+FETCH_TASKS = {"FetchReachWall-v0": "reach", "FetchPushWall-v0": "push"}
+
+
+@dataclass
+class _CollisionEnv(EnvConfig):
+    """What the configurations of this package have in common."""
+
+    @property
+    def package_name(self) -> str:
+        """The package that registers the environments with Gymnasium."""
+        return "lerobot_pf2mp"
+
+    def create_envs(
+        self, n_envs: int, use_async_envs: bool = False
+    ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+        """The vectorised environment, ``{type: {0: env}}``.
+
+        Finished sub-environments are frozen until the next rollout. LeRobot's default resets them at once and then
+        counts the first reward of the next episode, here a collision, into the finished one.
+        """
+        # The prefix makes a worker process import the module that registers the environment.
+        make_env = partial(
+            gym.make,
+            f"lerobot_pf2mp:{self.gym_id}",
+            disable_env_checker=self.disable_env_checker,
+            **self.gym_kwargs,
+        )
+        env_fns = [freeze_after_episode_end(make_env)] * n_envs
+        env: gym.vector.VectorEnv
+        autoreset_mode = gym.vector.AutoresetMode.NEXT_STEP
+        if use_async_envs and n_envs > 1:
+            env = gym.vector.AsyncVectorEnv(env_fns, context="forkserver", autoreset_mode=autoreset_mode)
+        else:
+            env = gym.vector.SyncVectorEnv(env_fns, autoreset_mode=autoreset_mode)
+        return {self.type: {0: env}}
 
 
 @EnvConfig.register_subclass("pf2mp_maze")
 @dataclass
-class PF2MPMazeEnv(EnvConfig):
+class PF2MPMazeEnv(_CollisionEnv):
     """The maze environments, `lerobot_pf2mp.envs.maze.MazeEnv`.
 
     Args:
@@ -68,11 +105,6 @@ class PF2MPMazeEnv(EnvConfig):
             raise ConfigError(f"task must be one of {list(MAZE_TASKS)}, got {self.task!r}")
 
     @property
-    def package_name(self) -> str:
-        """The package that registers the environments with Gymnasium."""
-        return "lerobot_pf2mp"
-
-    @property
     def gym_kwargs(self) -> dict[str, Any]:
         """Arguments for ``gymnasium.make``."""
         kwargs: dict[str, Any] = {
@@ -88,26 +120,80 @@ class PF2MPMazeEnv(EnvConfig):
             kwargs["maze_map"] = self.maze_map
         return kwargs
 
-    def create_envs(
-        self, n_envs: int, use_async_envs: bool = False
-    ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
-        """The vectorised environment, ``{type: {0: env}}``.
 
-        Finished sub-environments are frozen until the next rollout. LeRobot's default resets them at once and then
-        counts the first reward of the next episode, here a collision, into the finished one.
+@EnvConfig.register_subclass("pf2mp_fetch")
+@dataclass
+class PF2MPFetchEnv(_CollisionEnv):
+    """The Fetch environments with a wall, `lerobot_pf2mp.envs.fetch.FetchEnv`.
+
+    Args:
+        task: FetchReachWall-v0 or FetchPushWall-v0.
+        fps: Control frequency [Hz]; 25 with one inner step.
+        episode_length: Steps after which an episode ends.
+        wall_position: x, y of the wall's centre [m]; by default, as below, the task's.
+        wall_size: Its sides [m].
+        start_range: Two opposite corners x, y, z of where the gripper starts [m].
+        goal_range: The same of the goal [m]; for FetchPushWall-v0 x and y only.
+        block_range: The same of the block, x and y [m].
+        n_inner_steps: Steps of the inner loop for each action, 0.04 s each.
+        terminate_on_success: Whether an episode ends at the goal rather than after `episode_length` steps.
+        render_size: Width of the rendered picture [pixels].
+    """
+
+    task: str | None = "FetchReachWall-v0"
+    fps: int = 25
+    episode_length: int = 48
+    wall_position: tuple[float, float] | None = None
+    wall_size: tuple[float, float, float] | None = None
+    start_range: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    goal_range: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    block_range: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    n_inner_steps: int = 1
+    terminate_on_success: bool = False
+    render_size: int = 480
+    features_map: dict[str, str] = field(
+        default_factory=lambda: {
+            ACTION: ACTION,
+            "agent_pos": OBS_STATE,
+            "environment_state": OBS_ENV_STATE,
+        }
+    )
+
+    def __post_init__(self) -> None:
+        """Validates the task and its scene.
+
+        Raises:
+            ConfigError: If there is no such task, or the scene does not work.
         """
-        # The prefix makes a worker process import the module that registers the environment.
-        make_env = partial(
-            gym.make,
-            f"lerobot_pf2mp:{self.gym_id}",
-            disable_env_checker=self.disable_env_checker,
-            **self.gym_kwargs,
-        )
-        env_fns = [freeze_after_episode_end(make_env)] * n_envs
-        env: gym.vector.VectorEnv
-        autoreset_mode = gym.vector.AutoresetMode.NEXT_STEP
-        if use_async_envs and n_envs > 1:
-            env = gym.vector.AsyncVectorEnv(env_fns, context="forkserver", autoreset_mode=autoreset_mode)
-        else:
-            env = gym.vector.SyncVectorEnv(env_fns, autoreset_mode=autoreset_mode)
-        return {self.type: {0: env}}
+        if self.task not in FETCH_TASKS:
+            raise ConfigError(f"task must be one of {list(FETCH_TASKS)}, got {self.task!r}")
+        with reported_on_the_command_line():
+            scene = make_scene(FETCH_TASKS[self.task], **self._scene_changes)
+        n_objects = 2 if scene.has_block else 1
+        self.features = {
+            ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(3,)),
+            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(3,)),
+            "environment_state": PolicyFeature(type=FeatureType.ENV, shape=(3 * n_objects,)),
+        }
+
+    @property
+    def wall(self) -> Box:
+        """The wall [m]."""
+        return make_scene(FETCH_TASKS[str(self.task)], **self._scene_changes).wall
+
+    @property
+    def _scene_changes(self) -> dict[str, Any]:
+        names = ("wall_position", "wall_size", "start_range", "goal_range", "block_range")
+        return {name: getattr(self, name) for name in names}
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """Arguments for ``gymnasium.make``."""
+        return {
+            **self._scene_changes,
+            "max_episode_steps": self.episode_length,
+            "n_inner_steps": self.n_inner_steps,
+            "terminate_on_success": self.terminate_on_success,
+            "render_mode": "rgb_array",
+            "render_size": self.render_size,
+        }

@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where things are in the Fetch tasks: the wall, and where the gripper, the block and the goal may be placed."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from lerobot_pf2mp.envs.box import Box
+
+TABLE = Box.between((1.05, 0.40, 0.0), (1.55, 1.10, 0.40))
+# Where the gripper is moved to; measured: it reaches every corner within 1 cm.
+WORKSPACE = Box.between((1.05, 0.45, 0.415), (1.55, 1.05, 0.80))
+# The hand and the closed fingers around the gripper's position (the site robot0:grip); measured in the model.
+HAND = Box.between((-0.040, -0.063, 0.052), (0.040, 0.063, 0.174))
+FINGERS = Box.between((-0.014, -0.015, -0.019), (0.014, 0.015, 0.059))
+BLOCK_SIZE = 0.05  # [m]
+BLOCK_HEIGHT = 0.425  # of the block's centre on the table [m]
+
+SUCCESS_RADIUS = 0.05  # [m], gymnasium-robotics' own
+_MARGIN = 0.01  # between the hand and the wall where something is placed [m]
+_MIN_PUSH = 0.1  # [m]
+_MAX_WALL_TOP = 0.72  # so that the gripper can pass above [m]
+_N_TRIES = 1000
+
+Corners = tuple[tuple[float, ...], tuple[float, ...]]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """One episode's places.
+
+    Args:
+        start: ``(3,)`` the gripper's [m].
+        goal: ``(3,)`` where the gripper, or the block, is to go [m].
+        block: ``(3,)`` the block's centre [m]; None without a block.
+    """
+
+    start: np.ndarray
+    goal: np.ndarray
+    block: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class FetchScene:
+    """A wall on Fetch's table and the ranges that starts, goals and blocks are drawn from, evenly.
+
+    The table's top is at z = 0.40 m, x in 1.05 to 1.55 m (away from the robot), y in 0.40 to 1.10 m (to its left).
+
+    Args:
+        wall_position: x, y of the wall's centre [m]; it stands on the table.
+        wall_size: The wall's sides [m].
+        start_range: Two opposite corners of where the gripper starts [m].
+        goal_range: The same of the goal [m]; with a block x and y only, as goals lie on the table.
+        block_range: The same of the block, x and y [m]; None without a block.
+
+    Raises:
+        ValueError: If the wall leaves no way above it, or a range leaves no place that is clear of the wall and in reach.
+    """
+
+    wall_position: tuple[float, float]
+    wall_size: tuple[float, float, float]
+    start_range: Corners
+    goal_range: Corners
+    block_range: Corners | None = None
+
+    def __post_init__(self) -> None:
+        _check_numbers("wall_position", self.wall_position, 2)
+        _check_numbers("wall_size", self.wall_size, 3)
+        if min(self.wall_size) <= 0:
+            raise ValueError(f"wall_size must be positive [m], got {self.wall_size}")
+        if not TABLE.grown_by(Box((0, 0, 0), (-1e-9,) * 3)).contains(np.array([*self.wall_position, 0.2])):
+            raise ValueError(
+                f"wall_position must be on the table, x, y from {TABLE.low[:2].tolist()} to {TABLE.high[:2].tolist()} m, "
+                f"got {self.wall_position}"
+            )
+        if self.wall.high[2] > _MAX_WALL_TOP:
+            raise ValueError(
+                f"a wall must be at most {_MAX_WALL_TOP - TABLE.high[2]:.2f} m high so that the gripper can pass above it, "
+                f"got wall_size {self.wall_size}"
+            )
+        for name, n_coordinates in (
+            ("start_range", 3),
+            ("goal_range", 3 - self.has_block),
+            ("block_range", 2),
+        ):
+            corners = getattr(self, name)
+            if corners is not None:
+                _check_range(name, corners, n_coordinates)
+        self.sample(np.random.default_rng(0))
+
+    @property
+    def has_block(self) -> bool:
+        """Whether there is a block to push."""
+        return self.block_range is not None
+
+    @property
+    def wall(self) -> Box:
+        """The wall [m]."""
+        bottom = float(TABLE.high[2])
+        return Box((*self.wall_position, bottom + self.wall_size[2] / 2), self.wall_size)
+
+    def sample(self, rng: np.random.Generator) -> Layout:
+        """Draws an episode's places.
+
+        Raises:
+            ValueError: If none is found that is clear of the wall.
+        """
+        for _ in range(_N_TRIES):
+            start, goal = rng.uniform(*self.start_range), rng.uniform(*self.goal_range)
+            if self.block_range is None:
+                layout = Layout(start, goal)
+            else:
+                block = rng.uniform(*self.block_range)
+                layout = Layout(start, np.array([*goal, BLOCK_HEIGHT]), np.array([*block, BLOCK_HEIGHT]))
+            if self.fits(layout):
+                return layout
+        raise ValueError(
+            f"start, goal and block ranges must leave places clear of the wall, and ways to push along; none found in "
+            f"{_N_TRIES} tries with the wall at {self.wall_position} of size {self.wall_size}"
+        )
+
+    def fits(self, layout: Layout) -> bool:
+        """Whether start and goal are clear of the wall, and the block can be pushed to the goal in a straight line."""
+        if self.hits_wall(layout.start, layout.start, _MARGIN):
+            return False
+        if layout.block is None:
+            return not self.hits_wall(layout.goal, layout.goal, _MARGIN)
+        push = layout.goal - layout.block
+        length = math.hypot(*push)
+        if length < _MIN_PUSH or math.dist(layout.start[:2], layout.block[:2]) < _MIN_PUSH:
+            return False
+        # The gripper begins a fingers' and half a block's width behind.
+        behind = layout.block - push / length * 2 * BLOCK_SIZE
+        if np.any(behind[:2] < WORKSPACE.low[:2]) or np.any(behind[:2] > WORKSPACE.high[:2]):
+            return False
+        reach = BLOCK_SIZE / math.sqrt(2) + _MARGIN  # of the block, however it turns
+        pushed = Box((0, 0, 0), (2 * reach, 2 * reach, BLOCK_SIZE))
+        return not (
+            self.hits_wall(behind, layout.goal, _MARGIN)
+            or self.wall.grown_by(pushed).blocks(layout.block, layout.goal)
+        )
+
+    def is_blocked(self, layout: Layout) -> bool:
+        """Whether the gripper hits the wall on the straight way to the goal, with a block by way of the block."""
+        stations = [layout.start, *([] if layout.block is None else [layout.block]), layout.goal]
+        return any(self.hits_wall(a, b) for a, b in itertools.pairwise(stations))
+
+    def hits_wall(self, start: np.ndarray, end: np.ndarray, margin: float = 0.0) -> bool:
+        """Whether hand or fingers touch the wall when the gripper moves straight from one place to another.
+
+        Args:
+            start: ``(3,)`` [m].
+            end: ``(3,)`` [m].
+            margin: How far they must stay away [m].
+        """
+        spread = Box((0, 0, 0), (2 * margin,) * 3)
+        return any(self.wall.grown_by(part).grown_by(spread).blocks(start, end) for part in (HAND, FINGERS))
+
+
+def _check_numbers(name: str, values: object, n: int) -> None:
+    numbers = np.asarray(values, dtype=float)
+    if numbers.shape != (n,) or not np.isfinite(numbers).all():
+        raise ValueError(f"{name} must be {n} finite numbers [m], got {values}")
+
+
+def _check_range(name: str, corners: Corners, n_coordinates: int) -> None:
+    try:
+        low, high = np.asarray(corners, dtype=float)
+    except ValueError:
+        low = high = np.empty(0)
+    if low.shape != (n_coordinates,) or not np.isfinite([low, high]).all() or np.any(low > high):
+        raise ValueError(
+            f"{name} must be two corners of {n_coordinates} coordinates each [m], the smaller ones first, got {corners}"
+        )
+    reach = WORKSPACE.low[:n_coordinates], WORKSPACE.high[:n_coordinates]
+    if np.any(low < reach[0]) or np.any(high > reach[1]):
+        raise ValueError(
+            f"{name} must be in the gripper's reach, from {reach[0].tolist()} to {reach[1].tolist()} m, got {corners}"
+        )
+
+
+FETCH_SCENES = {
+    "reach": FetchScene(
+        wall_position=(1.30, 0.75),
+        wall_size=(0.30, 0.04, 0.20),
+        start_range=((1.20, 0.52, 0.45), (1.45, 0.64, 0.70)),
+        goal_range=((1.20, 0.86, 0.43), (1.45, 0.98, 0.68)),
+    ),
+    "push": FetchScene(
+        wall_position=(1.30, 0.75),
+        wall_size=(0.16, 0.04, 0.10),
+        start_range=((1.20, 0.52, 0.45), (1.40, 0.62, 0.55)),
+        goal_range=((1.10, 0.56), (1.50, 0.94)),
+        block_range=((1.10, 0.84), (1.50, 0.94)),
+    ),
+}
+
+
+def make_scene(task: str, **changes: Any) -> FetchScene:
+    """The scene of a task, with changes to its arguments; those that are None stay as they are.
+
+    Raises:
+        ValueError: If there is no such task, or the scene does not work.
+    """
+    if task not in FETCH_SCENES:
+        raise ValueError(f"task must be one of {list(FETCH_SCENES)}, got {task!r}")
+    scene = FETCH_SCENES[task]
+    changes = {name: value for name, value in changes.items() if value is not None}
+    if "block_range" in changes and not scene.has_block:
+        raise ValueError(f"block_range is for push only, got {changes['block_range']}")
+    return replace(scene, **changes)
