@@ -14,7 +14,7 @@ import pytest
 import yaml
 from lerobot.configs.train import TrainPipelineConfig
 
-from lerobot_pf2mp import DPPFConfig, PF2MPConfig, PF2MPMazeEnv
+from lerobot_pf2mp import DPPFConfig, PF2MPConfig, PF2MPFetchEnv, PF2MPMazeEnv
 from lerobot_pf2mp.cli import BenchmarkConfig, _benchmark_spec
 
 ROOT = Path(__file__).parents[1]
@@ -58,14 +58,15 @@ def test_configuration_files_are_valid(path: Path) -> None:
     assert f"--config_path={path.relative_to(ROOT)}" in path.read_text()  # the comment says how to use it
     if path.stem.startswith("train_"):
         config = draccus.parse(TrainPipelineConfig, path, args=[])
-        assert config.policy.horizon == 80
+        assert config.policy.horizon == (48 if "fetch" in path.stem else 80)
     elif "policies" in content:
         spec = _benchmark_spec(draccus.parse(BenchmarkConfig, path, args=[]))
         for changes in spec.variants.values():
             PF2MPConfig(device="cpu", **changes)
             DPPFConfig(device="cpu", **changes)
     else:
-        assert PF2MPMazeEnv(task=content["env"]["task"]).type == content["env"]["type"]
+        env = PF2MPFetchEnv if "fetch" in path.stem else PF2MPMazeEnv
+        assert env(task=content["env"]["task"]).type == content["env"]["type"]
         overrides = {key: value for key, value in content["policy"].items() if key != "path"}
         (DPPFConfig if "dppf" in path.stem else PF2MPConfig)(device="cpu", **overrides)
 
