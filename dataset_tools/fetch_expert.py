@@ -19,12 +19,12 @@ from lerobot_pf2mp.envs.fetch_scene import BLOCK_SIZE, FINGERS, HAND, WORKSPACE
 STYLES = {"clear": (0.02, 0.05), "hug": (0.002, 0.010)}
 
 _SPEED = (0.014, 0.022)  # [m] for each step of 0.04 s, drawn likewise
-_PUSH_SPEED = 0.010  # [m] for each step
+_PUSH_SPEED = 0.012  # [m] for each step
 _BEHIND = 0.070  # of the gripper behind the block's centre before it pushes [m]
 _PUSH_HEIGHT = 0.425  # of the gripper [m]
 _BLOCK_MARGIN = 0.01  # between fingers and block on the way to it [m]
 _ARRIVED = 0.01  # [m]
-_MAX_STEPS = 200
+_MAX_STEPS = 120
 
 
 @dataclass

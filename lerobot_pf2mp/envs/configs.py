@@ -14,7 +14,7 @@ from lerobot.envs.utils import freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from lerobot_pf2mp.envs.box import Box
-from lerobot_pf2mp.envs.fetch_scene import make_scene
+from lerobot_pf2mp.envs.fetch_scene import FETCH_FPS, check_inner_steps, make_scene
 from lerobot_pf2mp.errors import ConfigError, reported_on_the_command_line
 
 MAZE_TASKS = {"MazeUMaze-v0": "umaze", "MazeMedium-v0": "medium", "MazeLarge-v0": "large"}
@@ -128,7 +128,7 @@ class PF2MPFetchEnv(_CollisionEnv):
 
     Args:
         task: FetchReachWall-v0 or FetchPushWall-v0.
-        fps: Control frequency [Hz]; 25 with one inner step.
+        fps: Control frequency [Hz]; follows from `n_inner_steps`.
         episode_length: Steps after which an episode ends.
         wall_position: x, y of the wall's centre [m]; by default, as below, the task's.
         wall_size: Its sides [m].
@@ -141,7 +141,7 @@ class PF2MPFetchEnv(_CollisionEnv):
     """
 
     task: str | None = "FetchReachWall-v0"
-    fps: int = 25
+    fps: int = FETCH_FPS
     episode_length: int = 48
     wall_position: tuple[float, float] | None = None
     wall_size: tuple[float, float, float] | None = None
@@ -168,7 +168,9 @@ class PF2MPFetchEnv(_CollisionEnv):
         if self.task not in FETCH_TASKS:
             raise ConfigError(f"task must be one of {list(FETCH_TASKS)}, got {self.task!r}")
         with reported_on_the_command_line():
+            check_inner_steps(self.n_inner_steps)
             scene = make_scene(FETCH_TASKS[self.task], **self._scene_changes)
+        self.fps = round(FETCH_FPS / self.n_inner_steps)
         n_objects = 2 if scene.has_block else 1
         self.features = {
             ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(3,)),

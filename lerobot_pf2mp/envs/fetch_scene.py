@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,11 +22,13 @@ FINGERS = Box.between((-0.014, -0.015, -0.019), (0.014, 0.015, 0.059))
 BLOCK_SIZE = 0.05  # [m]
 BLOCK_HEIGHT = 0.425  # of the block's centre on the table [m]
 
+FETCH_FPS = 25  # [Hz], of gymnasium-robotics' Fetch
 SUCCESS_RADIUS = 0.05  # [m], gymnasium-robotics' own
 _MARGIN = 0.01  # between the hand and the wall where something is placed [m]
 _MIN_PUSH = 0.1  # [m]
 _MAX_WALL_TOP = 0.72  # so that the gripper can pass above [m]
 _N_TRIES = 1000
+_TINY = 1e-9
 
 Corners = tuple[tuple[float, ...], tuple[float, ...]]
 
@@ -73,12 +76,14 @@ class FetchScene:
         _check_numbers("wall_size", self.wall_size, 3)
         if min(self.wall_size) <= 0:
             raise ValueError(f"wall_size must be positive [m], got {self.wall_size}")
-        if not TABLE.grown_by(Box((0, 0, 0), (-1e-9,) * 3)).contains(np.array([*self.wall_position, 0.2])):
+        wall = self.wall
+        if np.any(wall.low[:2] < TABLE.low[:2] - _TINY) or np.any(wall.high[:2] > TABLE.high[:2] + _TINY):
             raise ValueError(
-                f"wall_position must be on the table, x, y from {TABLE.low[:2].tolist()} to {TABLE.high[:2].tolist()} m, "
-                f"got {self.wall_position}"
+                "a wall must stand on the table, x, y from "
+                f"{TABLE.low[:2].round(3).tolist()} to {TABLE.high[:2].round(3).tolist()} m, got one from "
+                f"{wall.low[:2].round(3).tolist()} to {wall.high[:2].round(3).tolist()}"
             )
-        if self.wall.high[2] > _MAX_WALL_TOP:
+        if wall.high[2] > _MAX_WALL_TOP + _TINY:
             raise ValueError(
                 f"a wall must be at most {_MAX_WALL_TOP - TABLE.high[2]:.2f} m high so that the gripper can pass above it, "
                 f"got wall_size {self.wall_size}"
@@ -104,21 +109,45 @@ class FetchScene:
         bottom = float(TABLE.high[2])
         return Box((*self.wall_position, bottom + self.wall_size[2] / 2), self.wall_size)
 
-    def sample(self, rng: np.random.Generator) -> Layout:
+    def sample(
+        self,
+        rng: np.random.Generator,
+        start: Sequence[float] | np.ndarray | None = None,
+        goal: Sequence[float] | np.ndarray | None = None,
+        block: Sequence[float] | np.ndarray | None = None,
+    ) -> Layout:
         """Draws an episode's places.
 
+        Args:
+            rng: Source of randomness.
+            start: ``(3,)`` the gripper's [m]; None, as for the others, to draw it.
+            goal: ``(3,)`` the goal's [m].
+            block: ``(3,)`` the block's centre [m]; without z on the table.
+
         Raises:
-            ValueError: If none is found that is clear of the wall.
+            ValueError: If a place is out of reach, or no layout is found that is clear of the wall.
         """
+        if block is not None and not self.has_block:
+            raise ValueError(f"block is for push only, got {block}")
+        lies_on_table = {"start": False, "goal": self.has_block, "block": True}
+        given = {
+            name: _check_place(name, place, lies_on_table[name])
+            for name, place in (("start", start), ("goal", goal), ("block", block))
+            if place is not None
+        }
         for _ in range(_N_TRIES):
-            start, goal = rng.uniform(*self.start_range), rng.uniform(*self.goal_range)
-            if self.block_range is None:
-                layout = Layout(start, goal)
-            else:
-                block = rng.uniform(*self.block_range)
-                layout = Layout(start, np.array([*goal, BLOCK_HEIGHT]), np.array([*block, BLOCK_HEIGHT]))
+            places = {"start": rng.uniform(*self.start_range), "goal": rng.uniform(*self.goal_range)}
+            if self.block_range is not None:
+                places["goal"] = np.array([*places["goal"], BLOCK_HEIGHT])
+                places["block"] = np.array([*rng.uniform(*self.block_range), BLOCK_HEIGHT])
+            layout = Layout(**{**places, **given})
             if self.fits(layout):
                 return layout
+        if given:
+            raise ValueError(
+                "start, goal and block must be clear of the wall, the block with room behind it and a free line to the "
+                f"goal of at least {_MIN_PUSH} m; none found with { ({k: v.tolist() for k, v in given.items()}) }"
+            )
         raise ValueError(
             f"start, goal and block ranges must leave places clear of the wall, and ways to push along; none found in "
             f"{_N_TRIES} tries with the wall at {self.wall_position} of size {self.wall_size}"
@@ -171,7 +200,7 @@ def _check_numbers(name: str, values: object, n: int) -> None:
 def _check_range(name: str, corners: Corners, n_coordinates: int) -> None:
     try:
         low, high = np.asarray(corners, dtype=float)
-    except ValueError:
+    except (TypeError, ValueError):
         low = high = np.empty(0)
     if low.shape != (n_coordinates,) or not np.isfinite([low, high]).all() or np.any(low > high):
         raise ValueError(
@@ -182,6 +211,32 @@ def _check_range(name: str, corners: Corners, n_coordinates: int) -> None:
         raise ValueError(
             f"{name} must be in the gripper's reach, from {reach[0].tolist()} to {reach[1].tolist()} m, got {corners}"
         )
+
+
+def _check_place(name: str, place: Sequence[float] | np.ndarray, lies_on_table: bool) -> np.ndarray:
+    position = np.asarray(place, dtype=float)
+    if lies_on_table and position.shape == (2,):
+        position = np.array([*position, BLOCK_HEIGHT])
+    is_reachable = position.shape == (3,) and bool(
+        np.all((position >= WORKSPACE.low) & (position <= WORKSPACE.high))
+    )
+    if not is_reachable or (lies_on_table and abs(position[2] - BLOCK_HEIGHT) > 1e-3):
+        height = f", z = {BLOCK_HEIGHT} on the table" if lies_on_table else ""
+        raise ValueError(
+            f"{name} must be a place x, y, z in the gripper's reach, from {WORKSPACE.low.round(3).tolist()} to "
+            f"{WORKSPACE.high.round(3).tolist()} m{height}, got {place}"
+        )
+    return position
+
+
+def check_inner_steps(n_inner_steps: int) -> None:
+    """Whether an action can have so many steps of the inner loop.
+
+    Raises:
+        ValueError: If not.
+    """
+    if not isinstance(n_inner_steps, int) or not 1 <= n_inner_steps <= FETCH_FPS:
+        raise ValueError(f"n_inner_steps must be a whole number from 1 to {FETCH_FPS}, got {n_inner_steps}")
 
 
 FETCH_SCENES = {
