@@ -11,16 +11,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lerobot_pf2mp.dataset_tools.episodes import Trajectory
+from lerobot_pf2mp.dataset_tools.episodes import Trajectory, resample
+from lerobot_pf2mp.dataset_tools.expert_checkpoint import ExpertCheckpoint
 from lerobot_pf2mp.dataset_tools.fetch_dataset import fetch_spec
 from lerobot_pf2mp.dataset_tools.fetch_expert import STYLES, Recording, ScriptedFetchExpert
+from lerobot_pf2mp.dataset_tools.learned_expert import LearnedFetchExpert, check_scene
 from lerobot_pf2mp.dataset_tools.write_trajectories import write_trajectories
 
-from lerobot_pf2mp.envs.fetch import FetchEnv
+from lerobot_pf2mp.envs.fetch import MAX_STEP, FetchEnv, picture_size_of
 from lerobot_pf2mp.envs.fetch_scene import make_scene
 from lerobot_pf2mp.worker_pool import worker_pool
 
 _CHUNK = 16  # demonstrations that a process makes in one go
+# An expert that succeeds in fewer of its first attempts would take for ever.
+_N_FIRST_ATTEMPTS, _MIN_SUCCESSES = 200, 4
 
 
 def collect_fetch(
@@ -35,8 +39,10 @@ def collect_fetch(
     seed: int,
     n_processes: int,
     overwrite: bool,
+    expert: Path | None = None,
+    picture_width: int | None = None,
 ) -> tuple[int, Counter[str]]:
-    """Collects successful, collision-free demonstrations of a scripted expert as a LeRobotDataset.
+    """Collects successful, collision-free demonstrations of an expert as a LeRobotDataset.
 
     The demonstrations do not depend on the number of processes.
 
@@ -46,32 +52,48 @@ def collect_fetch(
         repo_id: Its name, ``user/name``.
         n_episodes: Demonstrations to write.
         n_steps: Steps that each is resampled to.
-        style: How near the expert comes to the wall, clear or hug.
+        style: How near the scripted expert comes to the wall, clear or hug.
         scene_changes: Arguments of `FetchScene` that differ from the task's; None for those that do not.
         seed: Seed of everything random.
         n_processes: Processes side by side.
         overwrite: Whether a dataset already there is replaced.
+        expert: Folder of an expert that `train_expert` wrote; None is the scripted one.
+        picture_width: Width of a camera's pictures [pixels], their height is three quarters of it; None for no camera.
 
     Returns:
         The number of episodes written, and the number of those left out, by reason.
 
     Raises:
-        ValueError: If an argument breaks its rule.
+        ValueError: If an argument breaks its rule, or the expert almost never succeeds.
         FileExistsError: If `root` exists and `overwrite` is false.
+        ImportError: If the expert needs Stable-Baselines3 and it is missing.
+        OSError: If the expert's folder lacks a file.
     """
-    make_scene(task, **scene_changes)
+    scene = make_scene(task, **scene_changes)
     if style not in STYLES:
         raise ValueError(f"style must be one of {list(STYLES)}, got {style!r}")
     if n_processes < 1:
         raise ValueError(f"n_processes must be at least 1, got {n_processes}")
+    if expert is None:
+        origin = f"A scripted expert moved it (style {style}, seed {seed})."
+    elif style != "clear":
+        raise ValueError(f"style is for the scripted expert only, got {style!r}")
+    else:
+        checkpoint = ExpertCheckpoint.read(expert)
+        check_scene(checkpoint, scene)
+        checkpoint.load_policy()  # an error is clearer here than in a process
+        origin = f"{checkpoint.description} moved it (seed {seed})."
     failed: Counter[str] = Counter()
-    with worker_pool(n_processes, _start_worker, (task, scene_changes, style, seed)) as pool:
+    options: dict[str, Any] = dict(scene_changes)
+    picture_size = None
+    if picture_width is not None:
+        options |= {"render_mode": "rgb_array", "render_size": picture_width}
+        picture_size = picture_size_of(picture_width)
+    with worker_pool(n_processes, _start_worker, (task, options, style, seed, expert)) as pool:
         n_written, dropped = write_trajectories(
-            _successful(_demonstrations(pool, n_processes), failed),
+            _successful(_demonstrations(pool, n_processes), n_steps, failed),
             root=root,
-            spec=fetch_spec(
-                task, repo_id, f"A scripted expert moved it (style {style}, seed {seed}).", n_steps
-            ),
+            spec=fetch_spec(task, repo_id, origin, n_steps, picture_size),
             n_steps=n_steps,
             collides=lambda way: False,  # contact was looked for in every physics step
             n_episodes=n_episodes,
@@ -88,23 +110,40 @@ def _demonstrations(pool: ProcessPoolExecutor, n_processes: int) -> Iterator[Rec
         yield from ahead.pop(0).result()
 
 
-def _successful(recordings: Iterator[Recording], failed: Counter[str]) -> Iterator[Trajectory]:
-    for recording in recordings:
+def _successful(recordings: Iterator[Recording], n_steps: int, failed: Counter[str]) -> Iterator[Trajectory]:
+    for n_attempts, recording in enumerate(recordings):
+        if n_attempts == _N_FIRST_ATTEMPTS and n_attempts - failed.total() < _MIN_SUCCESSES:
+            reasons = ", ".join(f"{number} {reason}" for reason, number in failed.items())
+            raise ValueError(
+                f"the expert must succeed in at least {_MIN_SUCCESSES} of its first {n_attempts} attempts, "
+                f"got {n_attempts - failed.total()} ({reasons})"
+            )
         if recording.is_collision:
             failed["in collision"] += 1
         elif not recording.is_success:
             failed["without success"] += 1
+        elif _largest_step(recording, n_steps) > MAX_STEP:
+            failed[f"too long to be repeated in {n_steps} steps"] += 1
         else:
             objects = np.array(recording.blocks) if recording.blocks else None
-            yield Trajectory(np.array(recording.grips), recording.goal, objects)
+            pictures = np.array(recording.pictures) if recording.pictures else None
+            yield Trajectory(np.array(recording.grips), recording.goal, objects, pictures)
 
 
-_expert: ScriptedFetchExpert | None = None
+def _largest_step(recording: Recording, n_steps: int) -> float:
+    steps = np.diff(resample(np.array(recording.grips), n_steps), axis=0)
+    return float(np.linalg.norm(steps, axis=1).max())
 
 
-def _start_worker(task: str, scene_changes: dict[str, Any], style: str, seed: int) -> None:
+_expert: ScriptedFetchExpert | LearnedFetchExpert | None = None
+
+
+def _start_worker(task: str, options: dict[str, Any], style: str, seed: int, expert: Path | None) -> None:
     global _expert
-    _expert = ScriptedFetchExpert(FetchEnv(task, **scene_changes), style, seed)
+    env = FetchEnv(task, **options)
+    _expert = (
+        ScriptedFetchExpert(env, style, seed) if expert is None else LearnedFetchExpert(env, expert, seed)
+    )
 
 
 def _work(chunk: int) -> list[Recording]:

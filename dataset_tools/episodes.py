@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 MIN_STEPS = 2
+PICTURES = "observation.images.camera"
 
 
 @dataclass(frozen=True)
@@ -20,11 +21,13 @@ class Trajectory:
         positions: ``(N + 1, D)`` positions at equal time intervals [m].
         goal: ``(D,)`` where it was meant to end [m].
         objects: ``(N + 1, E)`` what else moved, for example the positions of a block [m]; None for nothing.
+        pictures: ``(N + 1, H, W, 3)`` uint8 what a camera saw; None without a camera.
     """
 
     positions: np.ndarray
     goal: np.ndarray
     objects: np.ndarray | None = None
+    pictures: np.ndarray | None = None
 
     @property
     def n_steps(self) -> int:
@@ -64,7 +67,8 @@ def prepare(
 
     Yields:
         For each trajectory ``{"observation.state", "observation.environment_state", "action"}``, float32 [m]: positions
-        ``(T, D)``, objects and goal ``(T, E + D)``, next positions ``(T, D)``.
+        ``(T, D)``, objects and goal ``(T, E + D)``, next positions ``(T, D)``; and the last pictures taken before
+        them, `PICTURES` ``(T, H, W, 3)``, if there are any.
 
     Raises:
         ValueError: If a trajectory is not finite.
@@ -83,8 +87,11 @@ def prepare(
         surroundings = [np.tile(trajectory.goal, (n_steps, 1))]
         if trajectory.objects is not None:
             surroundings.insert(0, resample(trajectory.objects, n_steps)[:-1])
-        yield {
+        frames = {
             "observation.state": way[:-1].astype(np.float32),
             "observation.environment_state": np.concatenate(surroundings, axis=1).astype(np.float32),
             "action": way[1:].astype(np.float32),
         }
+        if trajectory.pictures is not None:
+            frames[PICTURES] = trajectory.pictures[np.arange(n_steps) * trajectory.n_steps // n_steps]
+        yield frames

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from lerobot_pf2mp.dataset_tools.episodes import PICTURES
 from lerobot_pf2mp.dataset_tools.lerobot_writer import DatasetSpec
 
 FPS = 25
@@ -34,12 +35,15 @@ Every demonstration is resampled to {n_steps} steps by linear interpolation in t
 | `observation.state` | position x, y, z of the gripper | m |
 | `observation.environment_state` | positions x, y, z of {places} | m |
 | `action` | next position x, y, z of the gripper | m |
+| `observation.images.camera` | if present: the scene, from in front of the table | |
 
 x points away from the robot, y to its left, z up; the table's top is at z = 0.40 m. Made with lerobot_policy_pf2mp.
 """
 
 
-def fetch_spec(task: str, repo_id: str, origin: str, n_steps: int) -> DatasetSpec:
+def fetch_spec(
+    task: str, repo_id: str, origin: str, n_steps: int, picture_size: tuple[int, int] | None = None
+) -> DatasetSpec:
     """What a Fetch dataset holds besides its episodes.
 
     Args:
@@ -47,13 +51,18 @@ def fetch_spec(task: str, repo_id: str, origin: str, n_steps: int) -> DatasetSpe
         repo_id: The dataset's name, ``user/name``.
         origin: A sentence for the card: where the demonstrations come from.
         n_steps: Steps that each is resampled to.
+        picture_size: Height and width of the camera's pictures [pixels]; None without a camera.
     """
     description = TASK_DESCRIPTIONS[task]
     places = " and ".join(_PLACES[task])
     card = _CARD.format(
         title=repo_id, description=description, origin=origin, n_steps=n_steps, fps=FPS, places=places
     )
-    return DatasetSpec(repo_id, FPS, _features_of(task), description, card)
+    features = _features_of(task)
+    if picture_size is not None:
+        shape = (*picture_size, 3)
+        features[PICTURES] = {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"]}
+    return DatasetSpec(repo_id, FPS, features, description, card)
 
 
 def _features_of(task: str) -> dict[str, dict[str, Any]]:

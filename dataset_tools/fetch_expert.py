@@ -37,7 +37,7 @@ class Recording:
         blocks: The same of the block; empty without one.
         is_success: Whether the goal was reached at the end.
         is_collision: Whether something touched the wall.
-        images: Pictures ``(H, W, 3)`` before each step; empty unless asked for.
+        pictures: ``(H, W, 3)`` uint8, one for each position; empty if the environment does not render.
     """
 
     goal: np.ndarray
@@ -45,10 +45,14 @@ class Recording:
     blocks: list[np.ndarray] = field(default_factory=list)
     is_success: bool = False
     is_collision: bool = False
-    images: list[np.ndarray] = field(default_factory=list)
+    pictures: list[np.ndarray] = field(default_factory=list)
 
-    def note(self, observation: dict[str, np.ndarray], info: dict[str, Any]) -> None:
+    def note(
+        self, observation: dict[str, np.ndarray], info: dict[str, Any], picture: np.ndarray | None = None
+    ) -> None:
         """Adds an observation and what came with it."""
+        if picture is not None:
+            self.pictures.append(picture)
         self.grips.append(observation["agent_pos"].astype(float))
         if len(observation["environment_state"]) == 6:
             self.blocks.append(observation["environment_state"][:3].astype(float))
@@ -82,10 +86,10 @@ class ScriptedFetchExpert:
             options={"start": layout.start, "goal": layout.goal, "block": layout.block}
         )
         recording = Recording(layout.goal)
-        recording.note(observation, info)
+        recording.note(observation, info, self._env.render())
         for target in self._targets(recording, rng):
             observation, _, _, _, info = self._env.step(target.clip(WORKSPACE.low, WORKSPACE.high))
-            recording.note(observation, info)
+            recording.note(observation, info, self._env.render())
             if len(recording.grips) > _MAX_STEPS or recording.is_collision:
                 break
         return recording

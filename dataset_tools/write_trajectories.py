@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from lerobot_pf2mp.dataset_tools.episodes import Trajectory, prepare
 from lerobot_pf2mp.dataset_tools.lerobot_writer import DatasetSpec, write_dataset
+from lerobot_pf2mp.dataset_tools.video_writer import has_pictures, write_video_dataset
 from tqdm import tqdm
 
 
@@ -53,7 +54,8 @@ def write_trajectories(
     usable = islice(prepare(trajectories, n_steps, collides, dropped), n_episodes)
     # Closed here rather than by the garbage collector, so that an interrupted bar is not drawn again at the end.
     with closing(_with_progress(usable, n_episodes or n_expected)) as episodes:
-        n_written = write_dataset(root, spec, episodes, overwrite=overwrite)
+        write = write_video_dataset if has_pictures(spec) else write_dataset
+        n_written = write(root, spec, episodes, overwrite=overwrite)
     return n_written, dropped
 
 

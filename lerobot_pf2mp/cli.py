@@ -47,6 +47,7 @@ class CollectConfig:
         pf2mp-collect --maze_map=1111111/1000001/1011101/1000001/1111111 --root=data/ring
         pf2mp-collect --task=fetch_push --style=hug --n_processes=2 --root=data/fetch_push_hug
         pf2mp-collect --task=fetch_reach --scene.wall_size=[0.3,0.04,0.25] --root=data/high_wall
+        pf2mp-collect --task=fetch_reach --expert=outputs/expert_reach --root=data/fetch_reach_ppo
     """
 
     # What to demonstrate: maze_umaze, maze_medium, maze_large, fetch_reach or fetch_push.
@@ -63,10 +64,14 @@ class CollectConfig:
     action_noise: float = 0.0
     # Mazes: a map of your own instead of the task's: rows of 0 (free) and 1 (wall) separated by "/".
     maze_map: str | None = None
-    # Fetch: how near the expert comes to the wall: clear keeps away, hug passes close by.
+    # Fetch: scripted, or the folder of an expert trained by pf2mp-train-expert, in the same scene.
+    expert: str = "scripted"
+    # Fetch: how near the scripted expert comes to the wall: clear keeps away, hug passes close by.
     style: str = "clear"
     # Fetch: the wall, and where the gripper, the goal and the block are placed.
     scene: SceneConfig = field(default_factory=SceneConfig)
+    # Fetch: width of a camera's pictures [pixels], which are recorded as a video; none by default.
+    picture_width: int | None = None
     # Fetch: processes side by side.
     n_processes: int = 1
     # Seed of everything random.
@@ -76,10 +81,51 @@ class CollectConfig:
 
 
 @dataclass
+class TrainExpertConfig:
+    """Trains an expert for Fetch by reinforcement learning, for pf2mp-collect --expert=FOLDER.
+
+    Needs: pip install "lerobot_policy_pf2mp[experts]". Called again, it goes on where it was interrupted, or up to a larger
+    number of steps. The wall blocks the robot; touching it costs nothing unless asked for.
+
+    Examples:
+        pf2mp-train-expert --task=fetch_reach --output_dir=outputs/expert_reach
+        pf2mp-train-expert --task=fetch_push --algo=sac_her --total_steps=1000000 --device=cuda \
+--output_dir=outputs/expert_push
+        pf2mp-train-expert --task=fetch_reach --collision_penalty=0.5 --options='{net_arch: [128, 128]}' \
+--output_dir=outputs/careful
+    """
+
+    # What to learn: fetch_reach or fetch_push.
+    task: str = "fetch_reach"
+    # ppo, or sac_her (SAC with hindsight experience replay); by default ppo for fetch_reach, sac_her for fetch_push.
+    algo: str | None = None
+    # Environment steps of 0.04 s in all, rounded up to whole rollouts (ppo: 2048 steps).
+    total_steps: int = 1_000_000
+    # Folder of the expert.
+    output_dir: Path | None = None
+    # dense: minus the distance to the goal [m]; sparse: 0 within 0.05 m of it, else -1. By default dense for ppo, sparse
+    # for sac_her.
+    reward: str | None = None
+    # Subtracted from the reward of each step that touches the wall.
+    collision_penalty: float = 0.0
+    # The wall, and where the gripper, the goal and the block are placed.
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    # Changes to the algorithm's hyper-parameters, under the names of Stable-Baselines3.
+    options: dict[str, Any] = field(default_factory=dict)
+    # Seed of everything random.
+    seed: int = 0
+    # Environment steps between checkpoints.
+    save_freq: int = 50_000
+    # Where the networks are trained, cpu or cuda.
+    device: str = "cpu"
+
+
+@dataclass
 class SourceConfig:
     """Where recorded demonstrations come from."""
 
-    # Layout of the recording: d4rl (maze2d, one HDF5 file) or minari (pointmaze, a folder).
+    # Layout of the recording: d4rl (maze2d, one HDF5 file), minari (pointmaze, a folder) or fetch (gymnasium-robotics'
+    # FetchReach or FetchPush: an npz file, or the folder of a Minari dataset).
     type: str = "d4rl"
     # The file or folder.
     path: Path | None = None
@@ -93,11 +139,21 @@ class ConvertConfig:
         pf2mp-convert --source.type=d4rl --source.path=maze2d-large-sparse-v1.hdf5 --task=maze_large --root=data/d4rl
         pf2mp-convert --source.type=minari --source.path=~/.minari/datasets/D4RL/pointmaze/medium-v2 \
 --task=maze_medium --root=data/minari
+        pf2mp-convert --source.type=fetch --source.path=reach.npz --task=fetch_reach --root=data/reach
+        pf2mp-convert --source.type=fetch --source.path=~/.minari/datasets/fetch/push-v0 --task=fetch_push \
+--scene.wall_position=[1.30,0.80] --root=data/push
+
+    npz files of Fetch hold, without pickles, observation (E, T+1, 10 for Reach or 25 for Push) and desired_goal (E, T+1 or
+    T, 3) of E episodes. Or they hold the rows of all episodes, observation (N, 10 or 25) and desired_goal (N, 3), with
+    episode_ends (E), the row after each episode's last, or terminals and timeouts (N), true in each episode's last row. An
+    observation begins with the gripper's position, for Push followed by the block's [m]; an episode's last desired goal is
+    its goal. Episodes that do not end within 0.05 m of it are left out.
     """
 
     # The recording.
     source: SourceConfig = field(default_factory=SourceConfig)
-    # What was recorded: maze_umaze, maze_medium or maze_large. Episodes that touch its walls are left out.
+    # What was recorded: maze_umaze, maze_medium, maze_large, fetch_reach or fetch_push. Episodes that touch its walls are
+    # left out.
     task: str = "maze_large"
     # Folder of the dataset; by default where LeRobot keeps the datasets of your Hub account.
     root: Path | None = None
@@ -105,10 +161,12 @@ class ConvertConfig:
     repo_id: str | None = None
     # Most episodes to write; all by default.
     n_episodes: int | None = None
-    # Steps that each episode is resampled to.
-    n_steps: int = 80
-    # A map of your own instead of the task's: rows of 0 (free) and 1 (wall) separated by "/".
+    # Steps that each episode is resampled to; by default 80 for a maze, 48 for Fetch.
+    n_steps: int | None = None
+    # Mazes: a map of your own instead of the task's: rows of 0 (free) and 1 (wall) separated by "/".
     maze_map: str | None = None
+    # Fetch: where the wall is; the ranges only have to leave places clear of it.
+    scene: SceneConfig = field(default_factory=SceneConfig)
     # Whether to replace a dataset that is already there.
     overwrite: bool = False
 
@@ -288,6 +346,11 @@ def collect() -> None:
     _run(CollectConfig, _collect)
 
 
+def train_expert() -> None:
+    """The command pf2mp-train-expert."""
+    _run(TrainExpertConfig, _train_expert)
+
+
 def convert() -> None:
     """The command pf2mp-convert."""
     _run(ConvertConfig, _convert)
@@ -336,6 +399,8 @@ def _collect_maze(config: CollectConfig) -> None:
     from lerobot_pf2mp.dataset_tools.collect_maze import collect_maze
     from lerobot_pf2mp.dataset_tools.maze_dataset import maze_of
 
+    if config.expert != "scripted":
+        raise ValueError(f"expert must be scripted for a maze, got {config.expert!r}")
     repo_id, root = _dataset_place(config)
     n_steps = 80 if config.n_steps is None else config.n_steps
     n_written, dropped = collect_maze(
@@ -363,43 +428,102 @@ def _collect_fetch(config: CollectConfig, task: str) -> None:
         n_episodes=1000 if config.n_episodes is None else config.n_episodes,
         n_steps=n_steps,
         style=config.style,
+        picture_width=config.picture_width,
         scene_changes=asdict(config.scene),
         seed=config.seed,
         n_processes=config.n_processes,
         overwrite=config.overwrite,
+        expert=None if config.expert == "scripted" else Path(config.expert).expanduser(),
     )
     _report(n_written, n_steps, dropped, root)
 
 
-def _convert(config: ConvertConfig) -> None:
-    from lerobot_pf2mp.dataset_tools.convert_d4rl import read_d4rl
-    from lerobot_pf2mp.dataset_tools.convert_minari import read_minari
-    from lerobot_pf2mp.dataset_tools.maze_dataset import maze_of, write_maze_dataset
+def _train_expert(config: TrainExpertConfig) -> None:
+    from lerobot_pf2mp.dataset_tools.fetch_dataset import FETCH_OF_TASK
+    from lerobot_pf2mp.dataset_tools.train_expert import train_expert
 
+    if config.task not in FETCH_OF_TASK:
+        raise ValueError(f"task must be one of {list(FETCH_OF_TASK)}, got {config.task!r}")
+    output_dir = _given("--output_dir", config.output_dir).expanduser()
+    expert = train_expert(
+        FETCH_OF_TASK[config.task],
+        config.algo,
+        config.total_steps,
+        output_dir,
+        save_freq=config.save_freq,
+        device=config.device,
+        reward=config.reward,
+        collision_penalty=config.collision_penalty,
+        seed=config.seed,
+        scene_changes=asdict(config.scene),
+        options=config.options,
+    )
+    print(f"{expert.description} is in {output_dir}.")
+
+
+def _convert(config: ConvertConfig) -> None:
     source = config.source
     if source.path is None:
         raise ValueError("--source.path must name the recording, got none")
-    maze = maze_of(config.task, config.maze_map)
-    if source.type == "d4rl":
-        trajectories: Any = read_d4rl(source.path, maze)
-        n_expected = len(trajectories)
-    elif source.type == "minari":
-        n_expected, trajectories = read_minari(source.path)
+    if source.type in ("d4rl", "minari"):
+        _convert_maze(config, source.path)
+    elif source.type == "fetch":
+        _convert_fetch(config, source.path)
     else:
-        raise ValueError(f"--source.type must be one of ['d4rl', 'minari'], got {source.type!r}")
+        raise ValueError(f"--source.type must be one of ['d4rl', 'minari', 'fetch'], got {source.type!r}")
+
+
+def _convert_maze(config: ConvertConfig, path: Path) -> None:
+    from lerobot_pf2mp.dataset_tools.convert_d4rl import read_d4rl
+    from lerobot_pf2mp.dataset_tools.convert_minari import read_minari
+    from lerobot_pf2mp.dataset_tools.fetch_dataset import FETCH_OF_TASK
+    from lerobot_pf2mp.dataset_tools.maze_dataset import maze_of, write_maze_dataset
+
+    if config.task in FETCH_OF_TASK:
+        raise ValueError(f"--source.type must be fetch for {config.task}, got {config.source.type!r}")
+    maze = maze_of(config.task, config.maze_map)
+    if config.source.type == "d4rl":
+        trajectories: Any = read_d4rl(path, maze)
+        n_expected = len(trajectories)
+    else:
+        n_expected, trajectories = read_minari(path)
     repo_id, root = _dataset_place(config)
+    n_steps = 80 if config.n_steps is None else config.n_steps
     n_written, dropped = write_maze_dataset(
         trajectories,
         root=root,
         repo_id=repo_id,
         maze=maze,
-        origin=f"Converted from {source.path.name} ({source.type}).",
-        n_steps=config.n_steps,
+        origin=f"Converted from {path.name} ({config.source.type}).",
+        n_steps=n_steps,
         n_episodes=config.n_episodes,
         n_expected=n_expected,
         overwrite=config.overwrite,
     )
-    _report(n_written, config.n_steps, dropped, root)
+    _report(n_written, n_steps, dropped, root)
+
+
+def _convert_fetch(config: ConvertConfig, path: Path) -> None:
+    from lerobot_pf2mp.dataset_tools.convert_fetch import convert_fetch
+    from lerobot_pf2mp.dataset_tools.fetch_dataset import FETCH_OF_TASK
+
+    if config.maze_map is not None:
+        raise ValueError(f"--maze_map is for mazes only, got {config.maze_map}")
+    if config.task not in FETCH_OF_TASK:
+        raise ValueError(f"task must be one of {list(FETCH_OF_TASK)}, got {config.task!r}")
+    repo_id, root = _dataset_place(config)
+    n_steps = 48 if config.n_steps is None else config.n_steps
+    n_written, dropped = convert_fetch(
+        path,
+        FETCH_OF_TASK[config.task],
+        root=root,
+        repo_id=repo_id,
+        n_steps=n_steps,
+        scene_changes=asdict(config.scene),
+        n_episodes=config.n_episodes,
+        overwrite=config.overwrite,
+    )
+    _report(n_written, n_steps, dropped, root)
 
 
 def _fit_field(config: FitFieldConfig) -> None:

@@ -212,9 +212,13 @@ def plot_trajectories(
     rows = -(-len(pairs) // columns)
     left, right, bottom, top = (0.0, 1.0, 0.0, 1.0) if is_3d else scene.extent
     panel = _WIDTH / columns
-    size = (_WIDTH, rows * (panel * (0.85 if is_3d else (top - bottom) / (right - left)) + 0.3) + 0.5)
-    with _figure(output, theme, size, layout="constrained") as figure:
+    size = (_WIDTH, rows * (panel * (0.92 if is_3d else (top - bottom) / (right - left)) + 0.3) + 0.5)
+    # Axes in space do not tell the constrained layout how far their labels reach.
+    with _figure(output, theme, size, layout=None if is_3d else "constrained") as figure:
         axes = figure.subplots(rows, columns, squeeze=False, subplot_kw={"projection": "3d"} if is_3d else {})
+        if is_3d:
+            border = 0.55 / size[1]
+            figure.subplots_adjust(0.0, border, 0.97, 1 - border, wspace=0.05, hspace=0.28)
         for axis in axes.flat[len(pairs) :]:
             axis.set_axis_off()
         for axis, pair in zip(axes.flat, pairs, strict=False):
@@ -233,7 +237,7 @@ def plot_trajectories(
         figure.legend(
             [*handles, *cross],
             [*labels, "collision"],
-            loc="outside lower center",
+            loc="lower center" if is_3d else "outside lower center",
             ncols=5,
             frameon=False,
             labelcolor=theme.text,
@@ -424,7 +428,7 @@ def _draw_space(axis: Any, scene: Scene, pair: PathPair, theme: Theme) -> None:
             Poly3DCollection(_faces(box), facecolor=COLLISION, edgecolor=COLLISION, linewidth=0.8, alpha=0.25)
         )
     extent = np.ptp(np.concatenate([part[:, :3] for part in corners]), axis=0)
-    axis.set_box_aspect(extent.clip(min=0.2 * extent.max()), zoom=0.9)
+    axis.set_box_aspect(extent.clip(min=0.2 * extent.max()), zoom=0.88)
     for side in (axis.xaxis, axis.yaxis, axis.zaxis):
         side.set_pane_color(theme.floor)
         side._axinfo["grid"]["color"] = theme.grid

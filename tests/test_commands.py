@@ -116,9 +116,9 @@ def test_unknown_options_end_with_the_usage_and_nothing_written(tmp_path: Path) 
         (
             "pf2mp-plot",
             [
-                "lambda, density, arrows, trajectories, overview or flow",
+                "lambda, density, arrows, trajectories, overview, flow or video",
                 "collision and success rate against lambda",
-                "PNG, or GIF for flow",
+                "PNG, GIF for flow, MP4 for video",
                 "light or dark",
                 "(default: 100000)",
             ],
@@ -467,12 +467,13 @@ def test_plot_draws_from_results(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("figure", ["density", "arrows", "trajectories", "overview", "flow"])
+@pytest.mark.parametrize("figure", ["density", "arrows", "trajectories", "overview", "flow", "video"])
 def test_plot_draws_from_a_checkpoint(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], figure: str
 ) -> None:
     policy = write_checkpoint(tmp_path / "policy", "pf2mp")
-    output = tmp_path / f"{figure}.{'gif' if figure == 'flow' else 'png'}"
+    ending, mark = {"flow": ("gif", b"GIF89a"), "video": ("mp4", b"ftyp")}.get(figure, ("png", b"\x89PNG"))
+    output = tmp_path / f"{figure}.{ending}"
     run_plot(
         monkeypatch,
         f"--figure={figure}",
@@ -487,7 +488,7 @@ def test_plot_draws_from_a_checkpoint(
         f"--output={output}",
     )
     assert capsys.readouterr().out.endswith(f"Wrote {output}.\n")
-    assert output.read_bytes().startswith(b"GIF89a" if figure == "flow" else b"\x89PNG")
+    assert mark in output.read_bytes()[:12]
 
 
 @pytest.mark.slow

@@ -7,14 +7,18 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, preprocess_observation
+from lerobot.policies import make_pre_post_processors
 from test_benchmark import EPISODE_SEED, STATE, UMAZE, spec_of, write_checkpoint
 from test_results import SUMMARY, UNGUIDED
 
-from lerobot_pf2mp import PF2MPMazeEnv, load_policy, plots
+from lerobot_pf2mp import PF2MPConfig, PF2MPFetchEnv, PF2MPMazeEnv, load_policy, plots
 from lerobot_pf2mp.benchmark import run_benchmark
 from lerobot_pf2mp.figures import GuidedPolicyFigures, make_lambda_figure
 from lerobot_pf2mp.plots import Path2D, PathPair
+from lerobot_pf2mp.policies.pf2mp.modeling_pf2mp import PF2MPPolicy
+from lerobot_pf2mp.potential_field_processor import PotentialFieldProcessorStep
 from lerobot_pf2mp.results import EpisodeRow, SummaryRow, read_rows, write_rows
 
 ENV = PF2MPMazeEnv(task=UMAZE, episode_length=6)
@@ -26,8 +30,34 @@ def checkpoint(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPath
     return write_checkpoint(tmp_path_factory.mktemp("checkpoint") / request.param, request.param)
 
 
-def figures_of(checkpoint: str, env: Any = ENV, **options: Any) -> GuidedPolicyFigures:
+def figures_of(checkpoint: str | Path, env: Any = ENV, **options: Any) -> GuidedPolicyFigures:
     return GuidedPolicyFigures(checkpoint, env, seed=EPISODE_SEED, options=options)
+
+
+def write_fetch_checkpoint(folder: Path) -> Path:
+    """An untrained policy for pushing, whose field covers the middle of the table."""
+    config = PF2MPConfig(
+        device="cpu",
+        horizon=8,
+        n_action_steps=4,
+        down_dims=(8, 16),
+        diffusion_step_embed_dim=16,
+        input_features={
+            STATE: PolicyFeature(FeatureType.STATE, (3,)),
+            "observation.environment_state": PolicyFeature(FeatureType.ENV, (6,)),
+        },
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (3,))},
+    )
+    ends = {
+        name: {"min": torch.full((n,), 0.4), "max": torch.full((n,), 1.2)}
+        for name, n in ((STATE, 3), ("observation.environment_state", 6), ("action", 3))
+    }
+    preprocessor, postprocessor = make_pre_post_processors(config, dataset_stats=ends)
+    (step,) = (step for step in preprocessor.steps if isinstance(step, PotentialFieldProcessorStep))
+    step.demonstrations.observe(0.3 * torch.randn(4, 8, 3), None, None, settings=config.field_settings)
+    for part in (PF2MPPolicy(config), preprocessor, postprocessor):
+        part.save_pretrained(folder)
+    return folder
 
 
 def length_of(path: Path2D) -> float:
@@ -149,6 +179,34 @@ def test_every_figure_is_drawn_of_what_it_is_called(
         assert given["pair"].episode == 1
     elif figure == "flow":
         assert given["guided"].shape[1] == len(given["starts"]) == len(given["goals"]) == 2
+
+
+def test_a_film_shows_every_step_of_the_episode_and_the_same_one_twice(checkpoint: str) -> None:
+    figures = figures_of(checkpoint)
+    pair = figures.path_pairs(1, [1])[0]
+    assert pair.n_side_by_side == 2
+    unguided, guided = figures.film(pair)
+    assert (
+        (len(unguided), len(guided)) == (len(pair.unguided.positions), len(pair.guided.positions)) == (7, 7)
+    )
+    np.testing.assert_array_equal(unguided[0], guided[0])
+    assert not np.array_equal(unguided[-1], guided[-1])
+    again, _ = figures.film(figures.path_pairs(1, [1])[0])
+    np.testing.assert_array_equal(unguided[-1], again[-1])
+
+
+@pytest.mark.slow
+def test_fetch_is_drawn_with_its_wall_and_its_block_is_no_part_of_the_way(tmp_path: Path) -> None:
+    env = PF2MPFetchEnv(task="FetchPushWall-v0", episode_length=3)
+    figures = figures_of(write_fetch_checkpoint(tmp_path / "policy"), env)
+    assert [box.size for box in figures.scene().obstacles] == [(0.16, 0.04, 0.10)]
+    (pair,) = figures.path_pairs(1, [0])
+    assert pair.unguided.positions.shape == (4, 3)
+    with pytest.raises(ValueError, match="needs a potential field over 2 action dimensions, got one over 3"):
+        figures.draw("density", tmp_path / "density.png", 1, [], "light")
+    figures.draw("trajectories", tmp_path / "trajectories.png", 1, [0], "light")
+    figures.draw("video", tmp_path / "video.mp4", 1, [0], "light")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["policy", "trajectories.png", "video.mp4"]
 
 
 def test_environments_are_closed(checkpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,11 +11,13 @@ from matplotlib import image
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from PIL import Image
 from test_results import SUMMARY, UNGUIDED, cell
 from torch import Tensor
 
 from lerobot_pf2mp import plots
+from lerobot_pf2mp.envs.box import Box
 from lerobot_pf2mp.plots import THEMES, Path2D, PathPair, Scene
 from lerobot_pf2mp.potential_field import PotentialField, fit
 from lerobot_pf2mp.results import Cell
@@ -239,6 +241,26 @@ def test_trajectories_of_three_coordinates_are_drawn_in_space(tmp_path: Path, dr
     drawn_way = np.stack(lines_of(axis)["with guidance"].get_data_3d(), axis=-1)
     np.testing.assert_array_equal(drawn_way, PAIR_3D.guided.positions)
     assert "goal" not in lines_of(axis)
+
+
+def test_obstacles_are_drawn_in_space(tmp_path: Path, drawn: list[Figure]) -> None:
+    wall = Box((0.25, 0.0, 0.1), (0.1, 0.4, 0.2))
+    scene = Scene(to_metres, obstacles=[wall])
+    plots.plot_trajectories(tmp_path / "trajectories.png", scene=scene, pairs=[PAIR_3D])
+    (axis,) = drawn[0].axes
+    (sides,) = (child for child in axis.collections if isinstance(child, Poly3DCollection))
+    corners = np.unique(np.concatenate(plots._faces(wall)), axis=0)
+    expected = [[x, y, z] for x in (0.2, 0.3) for y in (-0.2, 0.2) for z in (0.0, 0.2)]
+    np.testing.assert_allclose(corners, expected, atol=1e-12)
+    for face in plots._faces(
+        wall
+    ):  # four corners of one side, in order: each differs from the next on one axis
+        assert (np.abs(np.diff(face, axis=0, append=face[:1])) > 0).sum(axis=1).tolist() == [1, 1, 1, 1]
+    assert sides.get_alpha() == 0.25
+    # The axes show the wall and the way at one scale.
+    low, high = np.transpose([axis.get_xlim(), axis.get_ylim(), axis.get_zlim()])
+    assert np.all(low <= wall.low)
+    assert np.all(high >= wall.high)
 
 
 def test_the_overview_says_which_way_collides(tmp_path: Path, drawn: list[Figure]) -> None:

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import atexit
 import math
+import weakref
 from typing import Any
 
 import gymnasium as gym
@@ -103,8 +105,7 @@ class FetchEnv(gym.Env):
             raise ValueError(
                 f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}"
             )
-        if render_size < 32:
-            raise ValueError(f"render_size must be at least 32 pixels, got {render_size}")
+        height, width = picture_size_of(render_size)
         self.scene = make_scene(
             task,
             wall_position=wall_position,
@@ -122,8 +123,6 @@ class FetchEnv(gym.Env):
         )
         self._n_inner_steps = n_inner_steps
         self._terminate_on_success = terminate_on_success
-        # Video encoders want even sides.
-        width, height = 2 * (render_size // 2), 2 * round(3 * render_size / 8)
         self._fetch = make_fetch(
             self.scene.wall,
             self.scene.has_block,
@@ -148,7 +147,7 @@ class FetchEnv(gym.Env):
             self._fetch.data.site("object0").xpos if self.scene.has_block else None
         )
         self._goal = np.zeros(3)
-        self._is_running = False
+        self._is_running = self._has_rendered = False
         self._is_collision = self._is_plan_in_wall = False
         self._path_length = 0.0
 
@@ -212,7 +211,13 @@ class FetchEnv(gym.Env):
         if not self._is_running:
             raise gym.error.ResetNeeded("call reset() before render()")
         with rendering():
-            return self._fetch.render()
+            picture = self._fetch.render()
+        if not self._has_rendered:
+            # The renderer of an environment that nobody closes would complain when Python ends. Registered only now, as
+            # MuJoCo registers the end of OpenGL when it begins, and what is registered last is called first.
+            atexit.register(_close, weakref.ref(self._fetch))
+            self._has_rendered = True
+        return picture
 
     def close(self) -> None:
         """Frees the simulation."""
@@ -258,3 +263,20 @@ class FetchEnv(gym.Env):
             "clearance": clearance,
             "path_length": self._path_length,
         }
+
+
+def _close(env: weakref.ref[gym.Env]) -> None:
+    alive = env()
+    if alive is not None:
+        alive.close()
+
+
+def picture_size_of(render_size: int) -> tuple[int, int]:
+    """Height and width of the pictures of an environment [pixels], even numbers as video encoders want them.
+
+    Raises:
+        ValueError: If the width asked for is too small.
+    """
+    if render_size < 32:
+        raise ValueError(f"render_size must be at least 32 pixels, got {render_size}")
+    return 2 * round(3 * render_size / 8), 2 * (render_size // 2)

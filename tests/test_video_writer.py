@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot.datasets import LeRobotDataset
+from lerobot_pf2mp.dataset_tools.collect_fetch import collect_fetch
+from lerobot_pf2mp.dataset_tools.episodes import PICTURES, Trajectory, prepare
+from lerobot_pf2mp.dataset_tools.fetch_dataset import fetch_spec
+from lerobot_pf2mp.dataset_tools.fetch_expert import ScriptedFetchExpert
+from lerobot_pf2mp.dataset_tools.video_writer import has_pictures, write_video_dataset
+
+from lerobot_pf2mp.envs.fetch import FetchEnv
+
+SPEC = fetch_spec("reach", "local/reach", "Made up.", 6, picture_size=(48, 64))
+
+
+def episode(grey: int) -> dict[str, np.ndarray]:
+    """Six frames whose pictures become brighter."""
+    pictures = np.full((6, 48, 64, 3), grey, dtype=np.uint8) + 10 * np.arange(6, dtype=np.uint8).reshape(
+        -1, 1, 1, 1
+    )
+    positions = np.random.default_rng(grey).random((6, 3), dtype=np.float32)
+    return {
+        "observation.state": positions,
+        "observation.environment_state": positions,
+        "action": positions,
+        PICTURES: pictures,
+    }
+
+
+def test_pictures_and_numbers_read_back(tmp_path: Path) -> None:
+    root = tmp_path / "new" / "d"
+    assert write_video_dataset(root, SPEC, iter([episode(20), episode(120)])) == 2
+    assert [path.name for path in root.parent.iterdir()] == ["d"]
+    dataset = LeRobotDataset("local/reach", root=root)
+    assert (dataset.num_episodes, len(dataset), dataset.fps) == (2, 12, 25)
+    for number, grey in enumerate((20, 120)):
+        expected = episode(grey)
+        for frame in range(6):
+            item = dataset[6 * number + frame]
+            np.testing.assert_array_equal(item["action"], expected["action"][frame])
+            assert item[PICTURES].shape == (3, 48, 64)
+            assert 255 * float(item[PICTURES].mean()) == pytest.approx(grey + 10 * frame, abs=4)
+    assert (root / "README.md").read_text() == SPEC.card
+
+
+def test_a_dataset_without_episodes_or_with_an_error_on_the_way_leaves_nothing(tmp_path: Path) -> None:
+    def broken():
+        yield episode(20)
+        raise KeyboardInterrupt
+
+    with pytest.raises(ValueError, match="at least one episode, got none"):
+        write_video_dataset(tmp_path / "d", SPEC, iter([]))
+    with pytest.raises(KeyboardInterrupt):
+        write_video_dataset(tmp_path / "d", SPEC, broken())
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_specification_has_pictures_only_if_asked_for() -> None:
+    assert has_pictures(SPEC)
+    assert not has_pictures(fetch_spec("reach", "local/reach", "Made up.", 6))
+
+
+@pytest.mark.parametrize("n_steps", [3, 6, 12])
+def test_each_frame_has_the_last_picture_before_it(n_steps: int) -> None:
+    pictures = np.arange(7, dtype=np.uint8).reshape(-1, 1, 1, 1) * np.ones((1, 2, 2, 3), dtype=np.uint8)
+    trajectory = Trajectory(np.arange(21.0).reshape(7, 3), np.zeros(3), pictures=pictures)
+    (frames,) = prepare([trajectory], n_steps, lambda way: False, Counter())
+    taken = frames[PICTURES][:, 0, 0, 0]
+    position = frames["observation.state"][:, 0] / 3  # in steps of the recording
+    assert taken.tolist() == np.floor(position + 1e-6).tolist()
+
+
+@pytest.mark.slow
+def test_collected_pictures_are_those_of_the_environment(tmp_path: Path) -> None:
+    n_written, _ = collect_fetch(
+        "reach",
+        root=tmp_path / "d",
+        repo_id="local/reach",
+        n_episodes=1,
+        n_steps=48,
+        style="clear",
+        scene_changes={},
+        seed=3,
+        n_processes=1,
+        overwrite=False,
+        picture_width=64,
+    )
+    assert n_written == 1
+    dataset = LeRobotDataset("local/reach", root=tmp_path / "d")
+    recording = ScriptedFetchExpert(
+        FetchEnv("reach", render_mode="rgb_array", render_size=64), seed=3
+    ).demonstrate(0)
+    first, last = recording.pictures[0].astype(float), recording.pictures[-2].astype(float)
+    for frame, picture, other in ((0, first, last), (47, last, first)):
+        shown = 255 * dataset[frame][PICTURES].permute(1, 2, 0).numpy()
+        assert np.abs(shown - picture).mean() < 0.5 * np.abs(shown - other).mean()

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from lerobot_pf2mp.worker_pool import worker_pool
+
+_offset = 0
+
+
+def set_offset(offset: int) -> None:
+    global _offset
+    _offset = offset
+
+
+def add(value: int) -> tuple[int, int]:
+    return _offset + value, os.getpid()
+
+
+def leave_a_mark(folder: str, number: int) -> None:
+    time.sleep(0.2)
+    (Path(folder) / str(number)).touch()
+
+
+def test_tasks_run_in_other_processes_after_the_initializer() -> None:
+    with worker_pool(2, set_offset, (10,)) as pool:
+        results = list(pool.map(add, range(4)))
+    assert [result for result, _ in results] == [10, 11, 12, 13]
+    assert os.getpid() not in {process for _, process in results}
+    assert _offset == 0
+
+
+def test_what_has_not_begun_when_an_error_comes_is_dropped(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError, match="enough"), worker_pool(1, set_offset, (0,)) as pool:
+        for number in range(50):
+            pool.submit(leave_a_mark, str(tmp_path), number)
+        while not (tmp_path / "0").exists():
+            time.sleep(0.05)
+        raise RuntimeError("enough")
+    assert 1 <= len(list(tmp_path.iterdir())) < 10
+
+
+@pytest.mark.slow
+def test_an_interrupted_worker_says_nothing(tmp_path: Path) -> None:
+    (tmp_path / "program.py").write_text(
+        """
+import os, signal
+from lerobot_pf2mp.worker_pool import worker_pool
+
+def nothing(): pass
+def interrupt_oneself(): os.kill(os.getpid(), signal.SIGINT)
+
+if __name__ == "__main__":
+    with worker_pool(1, nothing, ()) as pool:
+        print(type(pool.submit(interrupt_oneself).exception()).__name__)
+"""
+    )
+    command = [sys.executable, tmp_path / "program.py"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (result.stdout, result.stderr) == ("BrokenProcessPool\n", "")
