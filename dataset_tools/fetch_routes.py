@@ -14,8 +14,8 @@ from lerobot_pf2mp.envs.box import Box
 def routes(start: np.ndarray, goal: np.ndarray, boxes: Sequence[Box]) -> list[np.ndarray]:
     """Ways from start to goal that pass through no box, the shortest first.
 
-    Candidates are the shortest way above everything that is in the way, in the vertical plane through both ends, and for
-    each box those around its two sides, in the inclined plane through both ends.
+    Candidates are the straight way; the shortest above everything that is in the way, in the vertical plane through both
+    ends; and for each box those around its two sides, in the inclined plane through both ends.
 
     Args:
         start: ``(3,)`` [m].
@@ -25,7 +25,7 @@ def routes(start: np.ndarray, goal: np.ndarray, boxes: Sequence[Box]) -> list[np
     Returns:
         Ways as ``(N, 3)`` corners [m], both ends among them.
     """
-    candidates = [_above(start, goal, boxes)]
+    candidates = [np.array([start, goal]), _above(start, goal, boxes)]
     for box in boxes:
         candidates += [_beside(start, goal, box, side) for side in (-1, 1)]
     # Ways lead along edges; rounding must not put them inside.

@@ -108,11 +108,14 @@ def test_unknown_options_end_with_the_usage_and_nothing_written(tmp_path: Path) 
                 *MAZES,
                 "by default local/TASK",
                 "of which 1 is the largest (100 N)",
-                "(default: 80)",
-                "(default: 4000)",
+                "by default 80 for a maze, 48 for Fetch",
+                "by default 4000 for a maze, 1000 for Fetch",
+                "fetch_reach or fetch_push",
+                "x, y of the wall's centre [m]",
+                "width of a camera's pictures [pixels]",
             ],
         ),
-        ("pf2mp-convert", [*MAZES, "by default local/TASK", "(default: 80)"]),
+        ("pf2mp-convert", [*MAZES, "by default local/TASK", "by default 80 for a maze, 48 for Fetch"]),
         (
             "pf2mp-plot",
             [
@@ -186,11 +189,11 @@ def test_ctrl_c_in_the_middle_of_collecting_leaves_nothing_behind(
     [
         (
             ["--task=kitchen"],
-            "error: task must be one of ['maze_umaze', 'maze_medium', 'maze_large'], got 'kitchen'",
+            "error: task must be one of ['maze_umaze', 'maze_medium', 'maze_large', 'fetch_reach', 'fetch_push'], got",
         ),
         (["--n_episodes=0"], "error: n_episodes must be at least 1, got 0"),
         (["--n_episodes=-5"], "error: n_episodes must be at least 1, got -5"),
-        (["--n_episodes=many"], "error: `n_episodes`: Couldn't parse 'many' into an int"),
+        (["--n_episodes=many"], "error: `n_episodes`: "),
         (["--n_steps=1"], "error: n_steps must be at least 2, got 1"),
         (["--action_noise=-0.5"], "error: action_noise must be finite and at least 0, got -0.5"),
         (["--action_noise=nan"], "error: action_noise must be finite and at least 0, got nan"),
@@ -317,7 +320,7 @@ def test_convert_reads_minari_and_stops_at_the_number_asked_for(
         (["--source.path=.", "--source.type=minari"], "error: . must hold a Minari dataset"),
         (
             ["--source.path=good.hdf5", "--source.type=rlds"],
-            "error: --source.type must be one of ['d4rl', 'minari']",
+            "error: --source.type must be one of ['d4rl', 'minari', 'fetch']",
         ),
         (["--source.path=good.hdf5", "--task=maze"], "error: task must be one of"),
         (["--source.path=good.hdf5", "--n_steps=0"], "error: n_steps must be at least 2, got 0"),
@@ -528,3 +531,42 @@ def test_bad_values_for_plot_end_in_one_line_and_nothing_written(
     given = ("--figure=density", "--checkpoint=pf2mp", "--env.type=pf2mp_maze", "--output=figure.png")
     assert refused(cli.plot, *given, *options).startswith(message)
     assert everything_in(tmp_path) == before
+
+
+# Fetch
+
+
+@pytest.mark.slow
+def test_collect_takes_demonstrations_in_fetch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = tmp_path / "d"
+    options = ("--task=fetch_reach", "--n_episodes=2", "--scene.wall_size=[0.2,0.04,0.1]", f"--root={root}")
+    monkeypatch.setattr(sys, "argv", ["pf2mp-collect", *options])
+    cli.collect()
+    assert capsys.readouterr().out.startswith(f"Wrote 2 episodes of 48 steps to {root} (left out: ")
+    dataset = LeRobotDataset("local/fetch_reach", root=root)
+    assert (dataset.num_episodes, dataset.num_frames, dataset.fps) == (2, 96, 25)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--style=fast"], "error: style must be one of ['clear', 'hug'], got 'fast'"),
+        (["--n_processes=0"], "error: n_processes must be at least 1, got 0"),
+        (["--scene.wall_size=[0.3,0.04,0.9]"], "error: a wall must be at most 0.32 m high"),
+        (["--scene.wall_position=[9,9]"], "error: a wall must stand on the table"),
+        (["--scene.goal_range=[[1,2],[3,4]]"], "error: goal_range must be two corners of 3 coordinates"),
+        (["--scene.wall_size=tall"], "error: `scene.wall_size`"),
+        (["--picture_width=3"], "error: render_size must be at least 32 pixels, got 3"),
+        (["--expert=nowhere"], "error: nowhere must be a folder written by pf2mp-train-expert"),
+    ],
+)
+def test_bad_values_for_fetch_end_in_one_line_and_nothing_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Callable[..., str], options: list, message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    given = ("--task=fetch_reach", "--n_episodes=1", "--root=d", *options)
+    assert refused(cli.collect, *given).startswith(message)
+    assert everything_in(tmp_path) == []
