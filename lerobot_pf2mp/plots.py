@@ -218,7 +218,7 @@ def plot_trajectories(
         axes = figure.subplots(rows, columns, squeeze=False, subplot_kw={"projection": "3d"} if is_3d else {})
         if is_3d:
             border = 0.55 / size[1]
-            figure.subplots_adjust(0.0, border, 0.97, 1 - border, wspace=0.05, hspace=0.28)
+            figure.subplots_adjust(0.0, border, 0.94, 1 - border, wspace=0.05, hspace=0.28)
         for axis in axes.flat[len(pairs) :]:
             axis.set_axis_off()
         for axis, pair in zip(axes.flat, pairs, strict=False):
