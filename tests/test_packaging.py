@@ -15,7 +15,7 @@ import yaml
 from lerobot.configs.train import TrainPipelineConfig
 
 from lerobot_pf2mp import DPPFConfig, PF2MPConfig, PF2MPFetchEnv, PF2MPMazeEnv
-from lerobot_pf2mp.cli import BenchmarkConfig, _benchmark_spec
+from lerobot_pf2mp.commands.benchmark import BenchmarkConfig, make_spec
 
 ROOT = Path(__file__).parents[1]
 
@@ -60,7 +60,7 @@ def test_configuration_files_are_valid(path: Path) -> None:
         config = draccus.parse(TrainPipelineConfig, path, args=[])
         assert config.policy.horizon == (48 if "fetch" in path.stem else 80)
     elif "policies" in content:
-        spec = _benchmark_spec(draccus.parse(BenchmarkConfig, path, args=[]))
+        spec = make_spec(draccus.parse(BenchmarkConfig, path, args=[]))
         for changes in spec.variants.values():
             PF2MPConfig(device="cpu", **changes)
             DPPFConfig(device="cpu", **changes)

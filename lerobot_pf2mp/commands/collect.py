@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command pf2mp-collect."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from lerobot_pf2mp.commands.command import dataset_place, report
+from lerobot_pf2mp.commands.scene import SceneConfig
+
+
+@dataclass
+class CollectConfig:
+    """Makes demonstrations in a simulated environment and writes them as a LeRobotDataset.
+
+    Examples:
+        pf2mp-collect --task=maze_large --root=data/maze_large
+        pf2mp-collect --task=maze_medium --n_episodes=500 --action_noise=0.5 --seed=1 --root=data/noisy
+        pf2mp-collect --maze_map=1111111/1000001/1011101/1000001/1111111 --root=data/ring
+        pf2mp-collect --task=fetch_push --style=hug --n_processes=2 --root=data/fetch_push_hug
+        pf2mp-collect --task=fetch_reach --scene.wall_size=[0.3,0.04,0.25] --root=data/high_wall
+        pf2mp-collect --task=fetch_reach --expert=outputs/expert_reach --root=data/fetch_reach_ppo
+    """
+
+    # What to demonstrate: maze_umaze, maze_medium, maze_large, fetch_reach or fetch_push.
+    task: str = "maze_large"
+    # Folder of the dataset; by default where LeRobot keeps the datasets of your Hub account.
+    root: Path | None = None
+    # Name of the dataset, user/name; by default local/TASK.
+    repo_id: str | None = None
+    # Demonstrations to write; by default 4000 for a maze, 1000 for Fetch.
+    n_episodes: int | None = None
+    # Steps that each demonstration is resampled to; by default 80 for a maze, 48 for Fetch.
+    n_steps: int | None = None
+    # Mazes: standard deviation of the noise on the expert's force, of which 1 is the largest (100 N).
+    action_noise: float = 0.0
+    # Mazes: a map of your own instead of the task's: rows of 0 (free) and 1 (wall) separated by "/".
+    maze_map: str | None = None
+    # Fetch: scripted, or the folder of an expert trained by pf2mp-train-expert, in the same scene.
+    expert: str = "scripted"
+    # Fetch: how near the scripted expert comes to the wall: clear keeps away, hug passes close by.
+    style: str = "clear"
+    # Fetch: the wall, and where the gripper, the goal and the block are placed.
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    # Fetch: width of a camera's pictures [pixels], which are recorded as a video; none by default.
+    picture_width: int | None = None
+    # Fetch: processes side by side.
+    n_processes: int = 1
+    # Seed of everything random.
+    seed: int = 0
+    # Whether to replace a dataset that is already there.
+    overwrite: bool = False
+
+
+def main(config: CollectConfig) -> None:
+    """Runs the command."""
+    from lerobot_pf2mp.dataset_tools.fetch_dataset import FETCH_OF_TASK
+    from lerobot_pf2mp.dataset_tools.maze_dataset import MAZE_OF_TASK
+
+    if config.maze_map is not None or config.task in MAZE_OF_TASK:
+        _collect_maze(config)
+    elif config.task in FETCH_OF_TASK:
+        _collect_fetch(config, FETCH_OF_TASK[config.task])
+    else:
+        raise ValueError(f"task must be one of {[*MAZE_OF_TASK, *FETCH_OF_TASK]}, got {config.task!r}")
+
+
+def _collect_maze(config: CollectConfig) -> None:
+    from lerobot_pf2mp.dataset_tools.collect_maze import collect_maze
+    from lerobot_pf2mp.dataset_tools.maze_dataset import maze_of
+
+    if config.expert != "scripted":
+        raise ValueError(f"expert must be scripted for a maze, got {config.expert!r}")
+    repo_id, root = dataset_place(config.repo_id, config.root, "maze" if config.maze_map else config.task)
+    n_steps = 80 if config.n_steps is None else config.n_steps
+    n_written, dropped = collect_maze(
+        maze_of(config.task, config.maze_map),
+        root=root,
+        repo_id=repo_id,
+        n_episodes=4000 if config.n_episodes is None else config.n_episodes,
+        n_steps=n_steps,
+        action_noise=config.action_noise,
+        seed=config.seed,
+        overwrite=config.overwrite,
+    )
+    report(n_written, n_steps, dropped, root)
+
+
+def _collect_fetch(config: CollectConfig, task: str) -> None:
+    from lerobot_pf2mp.dataset_tools.collect_fetch import collect_fetch
+
+    repo_id, root = dataset_place(config.repo_id, config.root, "maze" if config.maze_map else config.task)
+    n_steps = 48 if config.n_steps is None else config.n_steps
+    n_written, dropped = collect_fetch(
+        task,
+        root=root,
+        repo_id=repo_id,
+        n_episodes=1000 if config.n_episodes is None else config.n_episodes,
+        n_steps=n_steps,
+        style=config.style,
+        picture_width=config.picture_width,
+        scene_changes=asdict(config.scene),
+        seed=config.seed,
+        n_processes=config.n_processes,
+        overwrite=config.overwrite,
+        expert=None if config.expert == "scripted" else Path(config.expert).expanduser(),
+    )
+    report(n_written, n_steps, dropped, root)

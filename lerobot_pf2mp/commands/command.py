@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the commands have in common: how they begin and end, and where datasets go."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import draccus
+
+from lerobot_pf2mp.errors import INTERRUPTED
+
+
+def run(config_class: type, main: Callable[[Any], None]) -> None:
+    """Parses the command line and runs a command; whatever a user can cause ends in one line and a non-zero code."""
+    # LeRobot's lengthy warning about a video decoder that these commands do not use.
+    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
+    try:
+        main(draccus.parse(config_class))
+    except KeyboardInterrupt:
+        print("interrupted: nothing half-written was left behind", file=sys.stderr)
+        sys.exit(INTERRUPTED)
+    except (
+        draccus.utils.DecodingError,
+        draccus.utils.ParsingError,
+        ValueError,
+        RuntimeError,
+        OSError,
+        ImportError,
+    ) as error:
+        print("error:", " ".join(str(error).split()), file=sys.stderr)
+        sys.exit(1)
+
+
+def given[T](option: str, value: T | None) -> T:
+    """The value of an option that must be given.
+
+    Raises:
+        ValueError: If it was not.
+    """
+    if value is None:
+        raise ValueError(f"{option} must be given")
+    return value
+
+
+def dataset_place(repo_id: str | None, root: Path | None, name: str) -> tuple[str, Path]:
+    """Name and folder of a dataset; by default local/NAME, and where LeRobot keeps datasets."""
+    from lerobot.utils.constants import HF_LEROBOT_HOME
+
+    repo_id = repo_id or f"local/{name}"
+    return repo_id, (root or HF_LEROBOT_HOME / repo_id).expanduser()
+
+
+def report(n_episodes: int, n_steps: int, dropped: Counter[str], root: Path) -> None:
+    """Says what was written and what was left out."""
+    left_out = ", ".join(f"{count} {reason}" for reason, count in dropped.items()) or "none"
+    print(f"Wrote {n_episodes} episodes of {n_steps} steps to {root} (left out: {left_out}).")

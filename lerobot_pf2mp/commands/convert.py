@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command pf2mp-convert."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lerobot_pf2mp.commands.command import dataset_place, report
+from lerobot_pf2mp.commands.scene import SceneConfig
+
+
+@dataclass
+class SourceConfig:
+    """Where recorded demonstrations come from."""
+
+    # Layout of the recording: d4rl (maze2d, one HDF5 file), minari (pointmaze, a folder) or fetch (gymnasium-robotics'
+    # FetchReach or FetchPush: an npz file, or the folder of a Minari dataset).
+    type: str = "d4rl"
+    # The file or folder.
+    path: Path | None = None
+
+
+@dataclass
+class ConvertConfig:
+    """Turns recorded demonstrations into a LeRobotDataset.
+
+    Examples:
+        pf2mp-convert --source.type=d4rl --source.path=maze2d-large-sparse-v1.hdf5 --task=maze_large --root=data/d4rl
+        pf2mp-convert --source.type=minari --source.path=~/.minari/datasets/D4RL/pointmaze/medium-v2 \
+--task=maze_medium --root=data/minari
+        pf2mp-convert --source.type=fetch --source.path=reach.npz --task=fetch_reach --root=data/reach
+        pf2mp-convert --source.type=fetch --source.path=~/.minari/datasets/fetch/push-v0 --task=fetch_push \
+--scene.wall_position=[1.30,0.80] --root=data/push
+
+    npz files of Fetch hold, without pickles, observation (E, T+1, 10 for Reach or 25 for Push) and desired_goal (E, T+1 or
+    T, 3) of E episodes. Or they hold the rows of all episodes, observation (N, 10 or 25) and desired_goal (N, 3), with
+    episode_ends (E), the row after each episode's last, or terminals and timeouts (N), true in each episode's last row. An
+    observation begins with the gripper's position, for Push followed by the block's [m]; an episode's last desired goal is
+    its goal. Episodes that do not end within 0.05 m of it are left out.
+    """
+
+    # The recording.
+    source: SourceConfig = field(default_factory=SourceConfig)
+    # What was recorded: maze_umaze, maze_medium, maze_large, fetch_reach or fetch_push. Episodes that touch its walls are
+    # left out.
+    task: str = "maze_large"
+    # Folder of the dataset; by default where LeRobot keeps the datasets of your Hub account.
+    root: Path | None = None
+    # Name of the dataset, user/name; by default local/TASK.
+    repo_id: str | None = None
+    # Most episodes to write; all by default.
+    n_episodes: int | None = None
+    # Steps that each episode is resampled to; by default 80 for a maze, 48 for Fetch.
+    n_steps: int | None = None
+    # Mazes: a map of your own instead of the task's: rows of 0 (free) and 1 (wall) separated by "/".
+    maze_map: str | None = None
+    # Fetch: where the wall is; the ranges only have to leave places clear of it.
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    # Whether to replace a dataset that is already there.
+    overwrite: bool = False
+
+
+def main(config: ConvertConfig) -> None:
+    """Runs the command."""
+    source = config.source
+    if source.path is None:
+        raise ValueError("--source.path must name the recording, got none")
+    if source.type in ("d4rl", "minari"):
+        _convert_maze(config, source.path)
+    elif source.type == "fetch":
+        _convert_fetch(config, source.path)
+    else:
+        raise ValueError(f"--source.type must be one of ['d4rl', 'minari', 'fetch'], got {source.type!r}")
+
+
+def _convert_maze(config: ConvertConfig, path: Path) -> None:
+    from lerobot_pf2mp.dataset_tools.convert_d4rl import read_d4rl
+    from lerobot_pf2mp.dataset_tools.convert_minari import read_minari
+    from lerobot_pf2mp.dataset_tools.fetch_dataset import FETCH_OF_TASK
+    from lerobot_pf2mp.dataset_tools.maze_dataset import maze_of, write_maze_dataset
+
+    if config.task in FETCH_OF_TASK:
+        raise ValueError(f"--source.type must be fetch for {config.task}, got {config.source.type!r}")
+    maze = maze_of(config.task, config.maze_map)
+    if config.source.type == "d4rl":
+        trajectories: Any = read_d4rl(path, maze)
+        n_expected = len(trajectories)
+    else:
+        n_expected, trajectories = read_minari(path)
+    repo_id, root = dataset_place(config.repo_id, config.root, "maze" if config.maze_map else config.task)
+    n_steps = 80 if config.n_steps is None else config.n_steps
+    n_written, dropped = write_maze_dataset(
+        trajectories,
+        root=root,
+        repo_id=repo_id,
+        maze=maze,
+        origin=f"Converted from {path.name} ({config.source.type}).",
+        n_steps=n_steps,
+        n_episodes=config.n_episodes,
+        n_expected=n_expected,
+        overwrite=config.overwrite,
+    )
+    report(n_written, n_steps, dropped, root)
+
+
+def _convert_fetch(config: ConvertConfig, path: Path) -> None:
+    from lerobot_pf2mp.dataset_tools.convert_fetch import convert_fetch
+    from lerobot_pf2mp.dataset_tools.fetch_dataset import FETCH_OF_TASK
+
+    if config.maze_map is not None:
+        raise ValueError(f"--maze_map is for mazes only, got {config.maze_map}")
+    if config.task not in FETCH_OF_TASK:
+        raise ValueError(f"task must be one of {list(FETCH_OF_TASK)}, got {config.task!r}")
+    repo_id, root = dataset_place(config.repo_id, config.root, "maze" if config.maze_map else config.task)
+    n_steps = 48 if config.n_steps is None else config.n_steps
+    n_written, dropped = convert_fetch(
+        path,
+        FETCH_OF_TASK[config.task],
+        root=root,
+        repo_id=repo_id,
+        n_steps=n_steps,
+        scene_changes=asdict(config.scene),
+        n_episodes=config.n_episodes,
+        overwrite=config.overwrite,
+    )
+    report(n_written, n_steps, dropped, root)
