@@ -19,8 +19,9 @@ from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 from lerobot.policies.factory import get_policy_class
 from torch import Tensor
 
-from lerobot_pf2mp import DPPFConfig, FMPConfig, PF2MPConfig, PF2MPMazeEnv, benchmark, load_policy
-from lerobot_pf2mp.benchmark import NONE, BenchmarkSpec, Guidance, run_benchmark
+from lerobot_pf2mp import DPPFConfig, FMPConfig, PF2MPConfig, PF2MPMazeEnv, evaluation, load_policy
+from lerobot_pf2mp.benchmark import run_benchmark
+from lerobot_pf2mp.benchmark_spec import NONE, BenchmarkSpec, Guidance
 from lerobot_pf2mp.envs.maze import MazeEnv
 from lerobot_pf2mp.errors import ConfigError
 from lerobot_pf2mp.policies.dppf.modeling_dppf import DPPFPolicy
@@ -191,13 +192,13 @@ def copied(whole: Path, tmp_path: Path) -> Path:
 def evaluations(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The guidance scales of the evaluations that really run."""
     scales: list[float] = []
-    eval_policy = benchmark.eval_policy
+    eval_policy = evaluation.eval_policy
 
     def counted(env: Any, policy: Any, *arguments: Any, **options: Any) -> Any:
         scales.append(getattr(policy.config, "guidance_scale", 0.0))
         return eval_policy(env, policy, *arguments, **options)
 
-    monkeypatch.setattr(benchmark, "eval_policy", counted)
+    monkeypatch.setattr(evaluation, "eval_policy", counted)
     return scales
 
 
@@ -451,7 +452,7 @@ def test_variants_change_the_configuration_of_the_policy(
     checkpoints: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     loaded = []
-    load = benchmark.load_policy
+    load = evaluation.load_policy
 
     def recorded(*arguments: Any, **options: Any) -> Any:
         policy, *processors = load(*arguments, **options)
@@ -459,7 +460,7 @@ def test_variants_change_the_configuration_of_the_policy(
         loaded.append((config.num_inference_steps, config.n_field_points, config.field_bandwidth))
         return policy, *processors
 
-    monkeypatch.setattr(benchmark, "load_policy", recorded)
+    monkeypatch.setattr(evaluation, "load_policy", recorded)
     variants = {
         "": {},
         "one step": {"num_inference_steps": 1},
@@ -721,7 +722,7 @@ def test_an_interruption_leaves_the_repeats_that_are_done(
     monkeypatch: pytest.MonkeyPatch,
     evaluations: list[float],
 ) -> None:
-    counted = benchmark.eval_policy
+    counted = evaluation.eval_policy
 
     def interrupted(*arguments: Any, **options: Any) -> Any:
         if len(evaluations) == 2:
@@ -729,7 +730,7 @@ def test_an_interruption_leaves_the_repeats_that_are_done(
         return counted(*arguments, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(benchmark, "eval_policy", interrupted)
+        patch.setattr(evaluation, "eval_policy", interrupted)
         with pytest.raises(KeyboardInterrupt):
             run_benchmark(whole_spec, tmp_path)
     assert timeless(rows_of(tmp_path)) == timeless(rows_of(whole))[: 2 * N_EPISODES]

@@ -12,7 +12,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot_pf2mp.envs.configs import PF2MPMazeEnv
 
 if TYPE_CHECKING:
-    from lerobot_pf2mp.benchmark import BenchmarkSpec
+    from lerobot_pf2mp.benchmark_spec import BenchmarkSpec
 
 
 @dataclass
@@ -70,7 +70,7 @@ def main(config: BenchmarkConfig) -> None:
 
 def make_spec(config: BenchmarkConfig) -> BenchmarkSpec:
     """What to compare, as `run_benchmark` wants it."""
-    from lerobot_pf2mp.benchmark import BenchmarkSpec, Guidance
+    from lerobot_pf2mp.benchmark_spec import BenchmarkSpec, Guidance
 
     return BenchmarkSpec(
         env=config.env,
