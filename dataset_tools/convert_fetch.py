@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 from lerobot_pf2mp.dataset_tools.episodes import MIN_STEPS, Trajectory, resample
 from lerobot_pf2mp.dataset_tools.fetch_dataset import fetch_spec
+from lerobot_pf2mp.dataset_tools.open_minari import open_minari
 from lerobot_pf2mp.dataset_tools.write_trajectories import write_trajectories
 
 from lerobot_pf2mp.envs.box import Box
@@ -229,15 +230,7 @@ def _ends(arrays: dict[str, np.ndarray], n: int, path: Path) -> np.ndarray:
 
 
 def _read_minari(path: Path) -> tuple[int, Iterator[dict[str, np.ndarray]]]:
-    import minari
-
-    data = path / "data" if (path / "data").is_dir() else path
-    try:
-        dataset = minari.MinariDataset(data)
-    except Exception as error:  # the storage formats raise a dozen types
-        raise ValueError(
-            f"{path} must hold a Minari dataset, got one that cannot be read: {error}"
-        ) from error
+    dataset = open_minari(path)
     return dataset.total_episodes, _observations(dataset, path)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from lerobot_pf2mp.dataset_tools.episodes import Trajectory
+from lerobot_pf2mp.dataset_tools.open_minari import open_minari
 
 
 def read_minari(path: Path) -> tuple[int, Iterator[Trajectory]]:
@@ -23,20 +24,7 @@ def read_minari(path: Path) -> tuple[int, Iterator[Trajectory]]:
         FileNotFoundError: If there is no such folder.
         ValueError: If it does not hold a Minari dataset of PointMaze.
     """
-    import minari
-
-    data = Path(path).expanduser()
-    data = data / "data" if (data / "data").is_dir() else data
-    if not data.is_dir():
-        raise FileNotFoundError(
-            f"source.path must be the folder of a Minari dataset, got {path}, which does not exist"
-        )
-    try:
-        dataset = minari.MinariDataset(data)
-    except Exception as error:  # the storage formats raise a dozen types
-        raise ValueError(
-            f"{path} must hold a Minari dataset, got one that cannot be read: {error}"
-        ) from error
+    dataset = open_minari(path)
     return dataset.total_episodes, _trajectories(dataset, path)
 
 

@@ -72,25 +72,11 @@ def write_maze_dataset(
     n_expected: int | None = None,
     overwrite: bool = False,
 ) -> tuple[int, Counter[str]]:
-    """Writes the usable ones of some trajectories as a LeRobotDataset.
+    """Writes the usable ones of some trajectories in a maze as a LeRobotDataset.
 
-    Args:
-        trajectories: The trajectories, in the coordinates of the environment [m].
-        root: The dataset's folder.
-        repo_id: Its name, ``user/name``.
-        maze: As for `parse_maze_map`; trajectories that touch its walls are left out.
-        origin: A sentence for the card: where the trajectories come from.
-        n_steps: Steps that each is resampled to.
-        n_episodes: Most episodes to write; None writes all.
-        n_expected: Number of trajectories, for the progress bar, if it is known.
-        overwrite: Whether a dataset already there is replaced.
-
-    Returns:
-        The number of episodes written, and the number of those left out, by reason.
-
-    Raises:
-        ValueError: If an argument breaks its rule or no trajectory is usable.
-        FileExistsError: If `root` exists and `overwrite` is false.
+    As `write_trajectories`, with the same arguments, result and errors; `trajectories` are in the coordinates of the
+    environment [m]. Besides, there is `repo_id`, the dataset's name ``user/name``; `maze`, as for `parse_maze_map`, whose
+    walls a trajectory must not touch; and `origin`, a sentence for the card: where the trajectories come from.
     """
     _, model = make_point_maze(maze)
     card = _CARD.format(title=repo_id, origin=origin, n_steps=n_steps, fps=FPS)

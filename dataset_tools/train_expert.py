@@ -74,7 +74,8 @@ def train_expert(
 
 def _found(folder: Path, wanted: ExpertSettings) -> ExpertCheckpoint | None:
     if not (folder / EXPERT_FILE).exists():
-        # An interruption before the first checkpoint leaves a folder that holds at most a beginning of it.
+        # A call that is killed before its first checkpoint is whole leaves nothing but that one's arrays. They may be
+        # complete, as the settings come last, but without these nothing can go on from them.
         if folder.exists() and any(not path.name.startswith((".", "steps_")) for path in folder.iterdir()):
             raise FileExistsError(
                 f"{folder} is no expert's folder, it holds no {EXPERT_FILE}: choose another --output_dir"

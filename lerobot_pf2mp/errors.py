@@ -6,8 +6,6 @@ from contextlib import contextmanager
 
 from draccus.utils import ParsingError
 
-INTERRUPTED = 130  # the shell's exit code for Ctrl-C
-
 
 class ConfigError(ParsingError):
     """A value of a configuration breaks its rule.

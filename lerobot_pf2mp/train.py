@@ -16,8 +16,8 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.factory import make_train_eval_datasets
 from lerobot.scripts import lerobot_train
 
-from lerobot_pf2mp.errors import INTERRUPTED
 from lerobot_pf2mp.in_memory_dataset import InMemoryDataset, fits_in_memory
+from lerobot_pf2mp.interruption import exit_code, sigterm_like_ctrl_c
 
 MEMORY_LIMIT_OPTION = "--in_memory_limit_gb"
 DEFAULT_MEMORY_LIMIT_GB = 4.0
@@ -58,10 +58,11 @@ def main() -> None:
     # The one place where the training function gets its data; there is no plug-in point for it in LeRobot 0.6.
     lerobot_train.make_train_eval_datasets = make_datasets
     try:
-        lerobot_train.main()
-    except KeyboardInterrupt:
+        with sigterm_like_ctrl_c():
+            lerobot_train.main()
+    except KeyboardInterrupt as interruption:
         print("\ninterrupted: training goes on from the last checkpoint with --resume=true", file=sys.stderr)
-        sys.exit(INTERRUPTED)
+        sys.exit(exit_code(interruption))
 
 
 def _in_memory(config: TrainPipelineConfig, dataset: Any, limit_bytes: float) -> Any:

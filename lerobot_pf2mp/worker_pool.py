@@ -15,7 +15,7 @@ from typing import Any
 def worker_pool(
     n_processes: int, initializer: Callable[..., None], arguments: tuple[Any, ...]
 ) -> Iterator[ProcessPoolExecutor]:
-    """Fresh processes; what they have not begun when the block is left is dropped.
+    """Fresh processes; what they have not begun when the block is left is dropped, and after an interruption all of it.
 
     Args:
         n_processes: How many.
@@ -30,6 +30,11 @@ def worker_pool(
     )
     try:
         yield pool
+    except KeyboardInterrupt:
+        # A terminal has interrupted them too, but `kill` reaches this process alone, and a task may take minutes.
+        for process in list(pool._processes.values()):
+            process.terminate()
+        raise
     finally:
         pool.shutdown(cancel_futures=True)
 

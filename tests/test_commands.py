@@ -149,9 +149,12 @@ def test_help_shows_examples_units_and_defaults(command: str, facts: list[str]) 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("metadata_begun", [False, True])
-def test_ctrl_c_in_the_middle_of_collecting_leaves_nothing_behind(
-    tmp_path: Path, metadata_begun: bool
+@pytest.mark.parametrize(
+    ("number", "code", "metadata_begun"),
+    [(signal.SIGINT, 130, False), (signal.SIGINT, 130, True), (signal.SIGTERM, 143, True)],
+)
+def test_ctrl_c_and_sigterm_in_the_middle_of_collecting_leave_nothing_behind(
+    tmp_path: Path, number: signal.Signals, code: int, metadata_begun: bool
 ) -> None:
     process = subprocess.Popen(
         [BIN / "pf2mp-collect", "--n_episodes=4000", f"--root={tmp_path / 'd'}"],
@@ -171,12 +174,12 @@ def test_ctrl_c_in_the_middle_of_collecting_leaves_nothing_behind(
             assert time.monotonic() < end
             time.sleep(0.01)
         time.sleep(0.1)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         output, errors = process.communicate(timeout=SECONDS)
     finally:
         process.kill()
         process.wait()
-    assert process.returncode == 130
+    assert process.returncode == code
     assert everything_in(tmp_path) == []
     assert output == ""
     assert "Traceback" not in errors

@@ -459,7 +459,18 @@ def test_an_interruption_of_collecting_leaves_nothing_behind(
 
 
 @pytest.mark.slow
-def test_ctrl_c_while_fetch_is_collected_leaves_nothing_behind(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("send", "number", "code"),
+    # As a terminal does, as the scheduler of a cluster does, and as `kill` does: workers are not told.
+    [
+        (os.killpg, signal.SIGINT, 130),
+        (os.killpg, signal.SIGTERM, 143),
+        (os.kill, signal.SIGTERM, 143),
+    ],
+)
+def test_ctrl_c_and_sigterm_while_fetch_is_collected_leave_nothing_behind(
+    tmp_path: Path, send: Callable[[int, int], None], number: signal.Signals, code: int
+) -> None:
     process = subprocess.Popen(
         [
             Path(sys.executable).parent / "pf2mp-collect",
@@ -477,12 +488,12 @@ def test_ctrl_c_while_fetch_is_collected_leaves_nothing_behind(tmp_path: Path) -
             assert process.poll() is None, process.communicate()
             assert time.monotonic() < end
             time.sleep(0.05)
-        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+        send(process.pid, number)
         output, errors = process.communicate(timeout=SECONDS)
     finally:
         process.kill()
         process.wait()
-    assert process.returncode == 130
+    assert process.returncode == code
     assert everything_in(tmp_path) == []
     assert output == ""
     assert "Traceback" not in errors

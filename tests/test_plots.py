@@ -19,6 +19,7 @@ from torch import Tensor
 from lerobot_pf2mp import plots
 from lerobot_pf2mp.envs.box import Box
 from lerobot_pf2mp.plots import THEMES, Path2D, PathPair, Scene
+from lerobot_pf2mp.plots.space import faces
 from lerobot_pf2mp.potential_field import PotentialField, fit
 from lerobot_pf2mp.results import Cell
 
@@ -249,12 +250,10 @@ def test_obstacles_are_drawn_in_space(tmp_path: Path, drawn: list[Figure]) -> No
     plots.plot_trajectories(tmp_path / "trajectories.png", scene=scene, pairs=[PAIR_3D])
     (axis,) = drawn[0].axes
     (sides,) = (child for child in axis.collections if isinstance(child, Poly3DCollection))
-    corners = np.unique(np.concatenate(plots._faces(wall)), axis=0)
+    corners = np.unique(np.concatenate(faces(wall)), axis=0)
     expected = [[x, y, z] for x in (0.2, 0.3) for y in (-0.2, 0.2) for z in (0.0, 0.2)]
     np.testing.assert_allclose(corners, expected, atol=1e-12)
-    for face in plots._faces(
-        wall
-    ):  # four corners of one side, in order: each differs from the next on one axis
+    for face in faces(wall):  # four corners of one side, in order: each differs from the next on one axis
         assert (np.abs(np.diff(face, axis=0, append=face[:1])) > 0).sum(axis=1).tolist() == [1, 1, 1, 1]
     assert sides.get_alpha() == 0.25
     # The axes show the wall and the way at one scale.

@@ -44,6 +44,17 @@ def test_what_has_not_begun_when_an_error_comes_is_dropped(tmp_path: Path) -> No
     assert 1 <= len(list(tmp_path.iterdir())) < 10
 
 
+def test_what_has_begun_is_dropped_too_when_an_interruption_comes(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt), worker_pool(1, set_offset, (0,)) as pool:
+        pool.submit(leave_a_mark, str(tmp_path), 0)
+        pool.submit(time.sleep, 60)
+        while not (tmp_path / "0").exists():
+            time.sleep(0.05)
+        began = time.monotonic()
+        raise KeyboardInterrupt
+    assert time.monotonic() - began < 30
+
+
 @pytest.mark.slow
 def test_an_interrupted_worker_says_nothing(tmp_path: Path) -> None:
     (tmp_path / "program.py").write_text(

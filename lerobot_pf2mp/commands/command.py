@@ -12,7 +12,7 @@ from typing import Any
 
 import draccus
 
-from lerobot_pf2mp.errors import INTERRUPTED
+from lerobot_pf2mp.interruption import exit_code, sigterm_like_ctrl_c
 
 
 def run(config_class: type, main: Callable[[Any], None]) -> None:
@@ -20,10 +20,11 @@ def run(config_class: type, main: Callable[[Any], None]) -> None:
     # LeRobot's lengthy warning about a video decoder that these commands do not use.
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
     try:
-        main(draccus.parse(config_class))
-    except KeyboardInterrupt:
+        with sigterm_like_ctrl_c():
+            main(draccus.parse(config_class))
+    except KeyboardInterrupt as interruption:
         print("interrupted: nothing half-written was left behind", file=sys.stderr)
-        sys.exit(INTERRUPTED)
+        sys.exit(exit_code(interruption))
     except (
         draccus.utils.DecodingError,
         draccus.utils.ParsingError,

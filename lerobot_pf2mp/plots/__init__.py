@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Figures; the only user of matplotlib. What is drawn comes from `figures.py`.
+
+Importing this package does not import matplotlib; drawing does.
+"""
+
+from lerobot_pf2mp.plots.animation import animate_flow
+from lerobot_pf2mp.plots.field import plot_arrows, plot_density
+from lerobot_pf2mp.plots.overview import plot_maze_overview
+from lerobot_pf2mp.plots.paths import Path2D, PathPair
+from lerobot_pf2mp.plots.rates import plot_lambda
+from lerobot_pf2mp.plots.scene import Scene
+from lerobot_pf2mp.plots.theme import ANCHOR, COLLISION, EULER, GOAL, GUIDED, START, THEMES, Theme
+from lerobot_pf2mp.plots.trajectories import plot_trajectories
+
+__all__ = [
+    "ANCHOR",
+    "COLLISION",
+    "EULER",
+    "GOAL",
+    "GUIDED",
+    "START",
+    "THEMES",
+    "Path2D",
+    "PathPair",
+    "Scene",
+    "Theme",
+    "animate_flow",
+    "plot_arrows",
+    "plot_density",
+    "plot_lambda",
+    "plot_maze_overview",
+    "plot_trajectories",
+]
