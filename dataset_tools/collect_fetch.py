@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from lerobot_pf2mp.dataset_tools.attempts import successful
 from lerobot_pf2mp.dataset_tools.episodes import Trajectory, resample
 from lerobot_pf2mp.dataset_tools.expert_checkpoint import ExpertCheckpoint
 from lerobot_pf2mp.dataset_tools.fetch_dataset import fetch_spec
@@ -18,13 +19,12 @@ from lerobot_pf2mp.dataset_tools.fetch_expert import STYLES, Recording, Scripted
 from lerobot_pf2mp.dataset_tools.learned_expert import LearnedFetchExpert, check_scene
 from lerobot_pf2mp.dataset_tools.write_trajectories import write_trajectories
 
-from lerobot_pf2mp.envs.fetch import MAX_STEP, FetchEnv, picture_size_of
+from lerobot_pf2mp.envs.fetch import MAX_STEP, FetchEnv
 from lerobot_pf2mp.envs.fetch_scene import make_scene
+from lerobot_pf2mp.envs.picture_size import picture_size_of
 from lerobot_pf2mp.worker_pool import worker_pool
 
 _CHUNK = 16  # demonstrations that a process makes in one go
-# An expert that succeeds in fewer of its first attempts would take for ever.
-_N_FIRST_ATTEMPTS, _MIN_SUCCESSES = 200, 4
 
 
 def collect_fetch(
@@ -90,8 +90,9 @@ def collect_fetch(
         options |= {"render_mode": "rgb_array", "render_size": picture_width}
         picture_size = picture_size_of(picture_width)
     with worker_pool(n_processes, _start_worker, (task, options, style, seed, expert)) as pool:
+        attempts = (_attempt(recording, n_steps) for recording in _demonstrations(pool, n_processes))
         n_written, dropped = write_trajectories(
-            _successful(_demonstrations(pool, n_processes), n_steps, failed),
+            successful(attempts, failed),
             root=root,
             spec=fetch_spec(task, repo_id, origin, n_steps, picture_size),
             n_steps=n_steps,
@@ -110,24 +111,16 @@ def _demonstrations(pool: ProcessPoolExecutor, n_processes: int) -> Iterator[Rec
         yield from ahead.pop(0).result()
 
 
-def _successful(recordings: Iterator[Recording], n_steps: int, failed: Counter[str]) -> Iterator[Trajectory]:
-    for n_attempts, recording in enumerate(recordings):
-        if n_attempts == _N_FIRST_ATTEMPTS and n_attempts - failed.total() < _MIN_SUCCESSES:
-            reasons = ", ".join(f"{number} {reason}" for reason, number in failed.items())
-            raise ValueError(
-                f"the expert must succeed in at least {_MIN_SUCCESSES} of its first {n_attempts} attempts, "
-                f"got {n_attempts - failed.total()} ({reasons})"
-            )
-        if recording.is_collision:
-            failed["in collision"] += 1
-        elif not recording.is_success:
-            failed["without success"] += 1
-        elif _largest_step(recording, n_steps) > MAX_STEP:
-            failed[f"too long to be repeated in {n_steps} steps"] += 1
-        else:
-            objects = np.array(recording.blocks) if recording.blocks else None
-            pictures = np.array(recording.pictures) if recording.pictures else None
-            yield Trajectory(np.array(recording.grips), recording.goal, objects, pictures)
+def _attempt(recording: Recording, n_steps: int) -> Trajectory | str:
+    if recording.is_collision:
+        return "in collision"
+    if not recording.is_success:
+        return "without success"
+    if _largest_step(recording, n_steps) > MAX_STEP:
+        return f"too long to be repeated in {n_steps} steps"
+    objects = np.array(recording.blocks) if recording.blocks else None
+    pictures = np.array(recording.pictures) if recording.pictures else None
+    return Trajectory(np.array(recording.grips), recording.goal, objects, pictures)
 
 
 def _largest_step(recording: Recording, n_steps: int) -> float:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Start-goal episodes of positions, resampled to a fixed number of steps."""
+"""Episodes of positions, resampled to a fixed number of steps."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ PICTURES = "observation.images.camera"
 
 @dataclass(frozen=True)
 class Trajectory:
-    """The way from a start to a goal.
+    """A demonstrated way.
 
     Args:
-        positions: ``(N + 1, D)`` positions at equal time intervals [m].
-        goal: ``(D,)`` where it was meant to end [m].
+        positions: ``(N + 1, D)`` positions at equal time intervals [m], joints [rad].
+        goal: ``(D,)`` where it was meant to end [m]; None where that is always the same.
         objects: ``(N + 1, E)`` what else moved, for example the positions of a block [m]; None for nothing.
         pictures: ``(N + 1, H, W, 3)`` uint8 what a camera saw; None without a camera.
     """
 
     positions: np.ndarray
-    goal: np.ndarray
+    goal: np.ndarray | None = None
     objects: np.ndarray | None = None
     pictures: np.ndarray | None = None
 
@@ -67,8 +67,8 @@ def prepare(
 
     Yields:
         For each trajectory ``{"observation.state", "observation.environment_state", "action"}``, float32 [m]: positions
-        ``(T, D)``, objects and goal ``(T, E + D)``, next positions ``(T, D)``; and the last pictures taken before
-        them, `PICTURES` ``(T, H, W, 3)``, if there are any.
+        ``(T, D)``, objects and goal ``(T, E + D)`` as far as there are any, next positions ``(T, D)``; and the last pictures
+        taken before them, `PICTURES` ``(T, H, W, 3)``, if there are any.
 
     Raises:
         ValueError: If a trajectory is not finite.
@@ -84,14 +84,17 @@ def prepare(
         if collides(way):
             dropped["in collision"] += 1
             continue
-        surroundings = [np.tile(trajectory.goal, (n_steps, 1))]
-        if trajectory.objects is not None:
-            surroundings.insert(0, resample(trajectory.objects, n_steps)[:-1])
         frames = {
             "observation.state": way[:-1].astype(np.float32),
-            "observation.environment_state": np.concatenate(surroundings, axis=1).astype(np.float32),
             "action": way[1:].astype(np.float32),
         }
+        surroundings = []
+        if trajectory.objects is not None:
+            surroundings.append(resample(trajectory.objects, n_steps)[:-1])
+        if trajectory.goal is not None:
+            surroundings.append(np.tile(trajectory.goal, (n_steps, 1)))
+        if surroundings:
+            frames["observation.environment_state"] = np.concatenate(surroundings, axis=1).astype(np.float32)
         if trajectory.pictures is not None:
             frames[PICTURES] = trajectory.pictures[np.arange(n_steps) * trajectory.n_steps // n_steps]
         yield frames

@@ -4,7 +4,7 @@
 Importing this package registers the policies, their processor step and the environments with LeRobot and Gymnasium.
 """
 
-from lerobot_pf2mp.envs import PF2MPFetchEnv, PF2MPMazeEnv
+from lerobot_pf2mp.envs import PF2MPFetchEnv, PF2MPHandwritingEnv, PF2MPMazeEnv
 from lerobot_pf2mp.loading import load_policy
 from lerobot_pf2mp.policies.dppf.configuration_dppf import DPPFConfig
 from lerobot_pf2mp.policies.fmp.configuration_fmp import FMPConfig
@@ -18,6 +18,7 @@ __all__ = [
     "FMPConfig",
     "PF2MPConfig",
     "PF2MPFetchEnv",
+    "PF2MPHandwritingEnv",
     "PF2MPMazeEnv",
     "PotentialFieldProcessorStep",
     "load_policy",

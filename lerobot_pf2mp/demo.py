@@ -201,6 +201,7 @@ def _evaluate(
             plan_in_wall=None,
             min_clearance_m=None,
             path_length_m=None,
+            stroke_error_mm=None,
             steps=None,
             chunk_latency_ms=None,
             checkpoint=str(checkpoint),

@@ -16,6 +16,7 @@ _OVER_STEPS: dict[str, Callable[[float, float], float]] = {
     "is_plan_in_wall": max,
     "clearance": min,
     "path_length": max,
+    "stroke_error": lambda _, latest: latest,
 }
 
 
@@ -29,6 +30,7 @@ class Episode:
         path_length: ``path_length`` at the end [m].
         steps: Control steps.
         plan_in_wall: Whether an action lay inside an obstacle (``is_plan_in_wall`` of any step).
+        stroke_error: ``stroke_error`` at the end [m].
     """
 
     collision: bool | None
@@ -36,6 +38,7 @@ class Episode:
     path_length: float | None
     steps: int
     plan_in_wall: bool | None = None
+    stroke_error: float | None = None
 
 
 class EpisodeRecorder(gym.vector.VectorWrapper):
@@ -104,6 +107,7 @@ class EpisodeRecorder(gym.vector.VectorWrapper):
                     plan_in_wall=_bool_or_none(reported.get("is_plan_in_wall")),
                     min_clearance=reported.get("clearance"),
                     path_length=reported.get("path_length"),
+                    stroke_error=reported.get("stroke_error"),
                     steps=steps,
                 )
             )

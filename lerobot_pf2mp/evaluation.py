@@ -106,6 +106,7 @@ class _Evaluator:
                 plan_in_wall=episode.plan_in_wall,
                 min_clearance_m=_rounded(episode.min_clearance),
                 path_length_m=_rounded(episode.path_length),
+                stroke_error_mm=_rounded(episode.stroke_error, 1000),
                 steps=episode.steps,
                 chunk_latency_ms=latency,
                 checkpoint=job.checkpoint,
@@ -138,8 +139,8 @@ def _work(job: Job) -> list[EpisodeRow]:
     return _worker(job)
 
 
-def _rounded(value: float | None) -> float | None:
-    return None if value is None else round(value, 6)
+def _rounded(value: float | None, factor: float = 1) -> float | None:
+    return None if value is None else round(factor * value, 6)
 
 
 def _measure_latency(

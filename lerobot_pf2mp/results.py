@@ -36,6 +36,7 @@ class EpisodeRow:
         plan_in_wall: Whether an action lay inside an obstacle, which says nothing about the robot around it.
         min_clearance_m: Smallest distance to an obstacle on the way [m], negative inside.
         path_length_m: Length of the way [m].
+        stroke_error_mm: Mean distance of what was drawn to what should have been [mm].
         steps: Control steps.
         chunk_latency_ms: Time to plan one chunk for one robot [ms]: the median over several calls, measured once for
             each policy, kind of guidance and repeat.
@@ -56,6 +57,7 @@ class EpisodeRow:
     plan_in_wall: bool | None
     min_clearance_m: float | None
     path_length_m: float | None
+    stroke_error_mm: float | None
     steps: int | None
     chunk_latency_ms: float | None
     checkpoint: str
@@ -82,6 +84,7 @@ class SummaryRow:
         only_guided_collides: Episodes in which this one collides and its twin does not; None without a twin.
         min_clearance_m: Mean over episodes [m].
         path_length_m: Mean over episodes [m].
+        stroke_error_mm: Mean over episodes [mm].
         chunk_latency_ms: Time to plan one chunk [ms].
         checkpoint: Where the policy was loaded from.
         commit: Commit of this package.
@@ -102,6 +105,7 @@ class SummaryRow:
     only_guided_collides: int | None
     min_clearance_m: float | None
     path_length_m: float | None
+    stroke_error_mm: float | None
     chunk_latency_ms: float | None
     checkpoint: str
     commit: str
@@ -159,6 +163,7 @@ def _summarise_repeat(
         only_guided_collides=sum(pair == (True, False) for pair in pairs) if is_paired else None,
         min_clearance_m=_mean_or_none([row.min_clearance_m for row in episodes]),
         path_length_m=_mean_or_none([row.path_length_m for row in episodes]),
+        stroke_error_mm=_mean_or_none([row.stroke_error_mm for row in episodes]),
         chunk_latency_ms=first.chunk_latency_ms,
         checkpoint=first.checkpoint,
         commit=first.commit,
@@ -208,6 +213,14 @@ class Cell:
     def success(self) -> Rate:
         """How many of all episodes reach the goal."""
         return Rate(sum(row.successes for row in self.repeats), self.n_episodes)
+
+    @property
+    def stroke_error(self) -> float | None:
+        """Mean over all episodes [mm]; None if the environment does not report it."""
+        sums = [
+            row.n_episodes * row.stroke_error_mm for row in self.repeats if row.stroke_error_mm is not None
+        ]
+        return sum(sums) / self.n_episodes if sums else None
 
     def deviation(self, count: str, over: str) -> float | None:
         """Standard deviation of a rate over repeats or training seeds; None if there is only one.

@@ -51,17 +51,21 @@ def make_latex(cells: Sequence[Cell]) -> str:
 def _rows(cells: Sequence[Cell]) -> tuple[list[str], list[list[str]]]:
     has_variants = any(cell.repeats[0].variant for cell in cells)
     has_plans = any(cell.plan_in_wall for cell in cells)
+    has_strokes = any(cell.stroke_error is not None for cell in cells)
     columns = [*_COLUMNS[:4], *(["variant"] if has_variants else []), *_COLUMNS[4:]]
     if has_plans:
         columns.insert(-2, "plans in the wall [%]")
-    return columns, [_row(cell, has_variants, has_plans) for cell in cells]
+    if has_strokes:
+        columns.insert(-1, "stroke error [mm]")
+    return columns, [_row(cell, has_variants, has_plans, has_strokes) for cell in cells]
 
 
-def _row(cell: Cell, has_variants: bool, has_plans: bool) -> list[str]:
+def _row(cell: Cell, has_variants: bool, has_plans: bool, has_strokes: bool) -> list[str]:
     first = cell.repeats[0]
     collision = cell.collision
     p = cell.mcnemar_p
     plan = cell.plan_in_wall
+    stroke_error = cell.stroke_error
     return [
         first.task,
         first.policy,
@@ -73,6 +77,7 @@ def _row(cell: Cell, has_variants: bool, has_plans: bool) -> list[str]:
         "" if p is None else _p_value(p),
         *([] if not has_plans else [""] if plan is None else [_rate(cell, plan, "plans_in_wall")]),
         _rate(cell, cell.success, "successes"),
+        *([] if not has_strokes else [""] if stroke_error is None else [f"{stroke_error:.2f}"]),
         _episodes(cell),
     ]
 

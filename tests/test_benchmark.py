@@ -36,7 +36,7 @@ HALF_WIDTH = 1.5  # of what the untrained policies' actions and observations are
 EPISODE_LENGTH, N_EPISODES, EPISODE_SEED = 6, 3, 7
 COLUMNS = (
     "task,policy,guidance_integrator,guidance_scale,variant,seed,repeat,episode,success,collision,plan_in_wall,min_clearance_m,"
-    "path_length_m,steps,chunk_latency_ms,checkpoint,commit"
+    "path_length_m,stroke_error_mm,steps,chunk_latency_ms,checkpoint,commit"
 )
 FEATURES: dict[str, Any] = {
     "device": "cpu",

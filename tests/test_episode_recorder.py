@@ -51,6 +51,13 @@ class Walk(gym.Env):
         }
 
 
+class Drawing(Walk):
+    """A walk that reports a stroke error, which comes down and goes up again."""
+
+    def _info(self) -> dict[str, Any]:
+        return {**super()._info(), "stroke_error": abs(self._step - 2.5)}
+
+
 def recorder_of(*walks: Walk, frozen: bool = True) -> EpisodeRecorder:
     """The walks side by side, as the environments of this package make them; not frozen, they begin again at their end."""
     env_fns = [partial(lambda walk: walk, walk) for walk in walks]
@@ -217,3 +224,11 @@ def test_the_numbers_of_a_maze_are_those_of_a_rollout_of_one_environment(control
         expected.append(episode)
     assert recorder.take_episodes(n_envs) == expected
     assert len({episode.steps for episode in expected}) > 1
+
+
+def test_the_stroke_error_is_that_at_the_end_neither_the_least_nor_the_largest() -> None:
+    recorder = recorder_of(Drawing([0.5] * 5), Walk([0.5] * 5))
+    roll_out(recorder, 6)
+    drawn, walked = recorder.take_episodes(2)
+    assert drawn.stroke_error == 1.5
+    assert walked.stroke_error is None

@@ -14,7 +14,7 @@ import pytest
 import yaml
 from lerobot.configs.train import TrainPipelineConfig
 
-from lerobot_pf2mp import DPPFConfig, PF2MPConfig, PF2MPFetchEnv, PF2MPMazeEnv
+from lerobot_pf2mp import DPPFConfig, PF2MPConfig, PF2MPFetchEnv, PF2MPHandwritingEnv, PF2MPMazeEnv
 from lerobot_pf2mp.commands.benchmark import BenchmarkConfig, make_spec
 
 ROOT = Path(__file__).parents[1]
@@ -39,6 +39,10 @@ print("discovered")
 """
 
 
+HORIZONS = {"maze": 80, "fetch": 48, "handwriting": 64}
+ENVS = {"maze": PF2MPMazeEnv, "fetch": PF2MPFetchEnv, "handwriting": PF2MPHandwritingEnv}
+
+
 def test_distribution_name_is_one_that_lerobot_looks_for() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert project["name"] == "lerobot_policy_pf2mp"
@@ -58,14 +62,15 @@ def test_configuration_files_are_valid(path: Path) -> None:
     assert f"--config_path={path.relative_to(ROOT)}" in path.read_text()  # the comment says how to use it
     if path.stem.startswith("train_"):
         config = draccus.parse(TrainPipelineConfig, path, args=[])
-        assert config.policy.horizon == (48 if "fetch" in path.stem else 80)
+        (horizon,) = (steps for task, steps in HORIZONS.items() if task in path.stem)
+        assert config.policy.horizon == horizon
     elif "policies" in content:
         spec = make_spec(draccus.parse(BenchmarkConfig, path, args=[]))
         for changes in spec.variants.values():
             PF2MPConfig(device="cpu", **changes)
             DPPFConfig(device="cpu", **changes)
     else:
-        env = PF2MPFetchEnv if "fetch" in path.stem else PF2MPMazeEnv
+        (env,) = (env for task, env in ENVS.items() if task in path.stem)
         assert env(task=content["env"]["task"]).type == content["env"]["type"]
         overrides = {key: value for key, value in content["policy"].items() if key != "path"}
         (DPPFConfig if "dppf" in path.stem else PF2MPConfig)(device="cpu", **overrides)

@@ -35,6 +35,7 @@ EPISODE = EpisodeRow(
     plan_in_wall=None,
     min_clearance_m=0.25,
     path_length_m=4.0,
+    stroke_error_mm=None,
     steps=80,
     chunk_latency_ms=2.5,
     checkpoint="outputs/policy",
@@ -54,6 +55,7 @@ SUMMARY = SummaryRow(
     only_guided_collides=None,
     min_clearance_m=0.25,
     path_length_m=4.0,
+    stroke_error_mm=None,
     chunk_latency_ms=2.5,
     checkpoint="outputs/policy",
     commit="0123456789",
@@ -202,6 +204,17 @@ def test_plans_in_the_wall_are_counted() -> None:
     rows = [replace(row, plan_in_wall=row.episode in (0, 3)) for row in episodes([True, False, False, True])]
     (summary,) = summarise(rows)
     assert (summary.collisions, summary.plans_in_wall) == (2, 2)
+
+
+def test_the_stroke_error_is_averaged_over_episodes_of_different_repeats() -> None:
+    rows = [*episodes([False, False], stroke_error_mm=2.0), *episodes([False], repeat=1, stroke_error_mm=5.0)]
+    summaries = summarise(rows)
+    assert [row.stroke_error_mm for row in summaries] == [2.0, 5.0]
+    (cell,) = group_cells(summaries)
+    assert cell.stroke_error == pytest.approx(3.0)
+    head, _, line = make_markdown([cell]).splitlines()
+    assert head.split(" | ")[-2] == "stroke error [mm]" and line.split(" | ")[-2] == "3.00"
+    assert make_markdown(group_cells(summarise(episodes([False])))).count("stroke") == 0
 
 
 def test_what_an_environment_does_not_report_stays_none() -> None:

@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+import itertools
 import shutil
 import sys
 from collections import Counter
@@ -10,12 +11,11 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
-from lerobot_pf2mp.dataset_tools import collect_fetch as collecting
+from lerobot_pf2mp.dataset_tools.attempts import successful
 from lerobot_pf2mp.dataset_tools.collect_fetch import collect_fetch
 from lerobot_pf2mp.dataset_tools.expert_algorithms import make_algorithm
 from lerobot_pf2mp.dataset_tools.expert_checkpoint import ExpertCheckpoint
 from lerobot_pf2mp.dataset_tools.expert_settings import ExpertSettings
-from lerobot_pf2mp.dataset_tools.fetch_expert import Recording
 from lerobot_pf2mp.dataset_tools.goal_env import (
     EPISODE_STEPS,
     LARGEST_STEP,
@@ -30,7 +30,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_of_stabl
 
 from lerobot_pf2mp import cli
 from lerobot_pf2mp.envs.fetch import MAX_STEP, FetchEnv
-from lerobot_pf2mp.errors import INTERRUPTED
+from lerobot_pf2mp.interruption import INTERRUPTED
 
 SMALL = {"learning_starts": 48, "batch_size": 8, "net_arch": [8], "buffer_size": 500}
 SMALL_PPO = {"n_envs": 1, "n_steps": 8, "batch_size": 8, "net_arch": [8]}
@@ -297,6 +297,14 @@ def test_another_expert_in_the_same_folder_is_refused(
         train_expert(total_steps=200, output_dir=trained, **arguments)
 
 
+def test_training_begins_anew_after_a_call_that_was_killed_before_it_named_its_first_checkpoint(
+    expert: Path,
+) -> None:
+    (expert / "expert.json").unlink()  # it comes last, so the arrays are all there
+    assert train_expert("push", "sac_her", 60, expert, options=SMALL).n_steps == 60
+    assert sorted(path.name for path in expert.iterdir()) == ["expert.json", "steps_60"]
+
+
 def test_a_folder_with_something_else_is_refused(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("precious")
     with pytest.raises(FileExistsError, match="is no expert's folder, it holds no expert.json"):
@@ -393,12 +401,12 @@ def test_collect_takes_demonstrations_from_an_experts_folder(tmp_path: Path) -> 
 
 
 def test_collecting_from_an_expert_that_hardly_ever_succeeds_is_given_up() -> None:
-    failures = iter(lambda: Recording(np.zeros(3)), None)  # without end
+    failures = itertools.repeat("without success")
     failed: Counter[str] = Counter()
     with pytest.raises(
         ValueError, match=r"at least 4 of its first 200 attempts, got 0 \(200 without success\)"
     ):
-        list(collecting._successful(failures, 48, failed))
+        list(successful(failures, failed))
 
 
 # The commands

@@ -8,10 +8,12 @@ from pathlib import Path
 
 from lerobot_pf2mp.commands.command import dataset_place, report
 from lerobot_pf2mp.commands.scene import SceneConfig
+from lerobot_pf2mp.commands.writing import WritingConfig
+from lerobot_pf2mp.envs.sheet import HANDWRITING_STEPS
 
 
 @dataclass
-class CollectConfig:
+class CollectConfig(WritingConfig):
     """Makes demonstrations in a simulated environment and writes them as a LeRobotDataset.
 
     Examples:
@@ -21,17 +23,21 @@ class CollectConfig:
         pf2mp-collect --task=fetch_push --style=hug --n_processes=2 --root=data/fetch_push_hug
         pf2mp-collect --task=fetch_reach --scene.wall_size=[0.3,0.04,0.25] --root=data/high_wall
         pf2mp-collect --task=fetch_reach --expert=outputs/expert_reach --root=data/fetch_reach_ppo
+        pf2mp-collect --task=handwriting_joint --letter=S --n_episodes=20 --root=data/handwriting_S
+        pf2mp-collect --task=handwriting_pen --scene_file=my_stroke.json --root=data/my_stroke
     """
 
-    # What to demonstrate: maze_umaze, maze_medium, maze_large, fetch_reach or fetch_push.
+    # What to demonstrate: maze_umaze, maze_medium, maze_large, fetch_reach, fetch_push, handwriting_joint or
+    # handwriting_pen.
     task: str = "maze_large"
     # Folder of the dataset; by default where LeRobot keeps the datasets of your Hub account.
     root: Path | None = None
     # Name of the dataset, user/name; by default local/TASK.
     repo_id: str | None = None
-    # Demonstrations to write; by default 4000 for a maze, 1000 for Fetch.
+    # Demonstrations to write; by default 4000 for a maze, 1000 for Fetch, 20 for handwriting_joint, 10 for
+    # handwriting_pen.
     n_episodes: int | None = None
-    # Steps that each demonstration is resampled to; by default 80 for a maze, 48 for Fetch.
+    # Steps that each demonstration is resampled to; by default 80 for a maze, 48 for Fetch, 64 for handwriting.
     n_steps: int | None = None
     # Mazes: standard deviation of the noise on the expert's force, of which 1 is the largest (100 N).
     action_noise: float = 0.0
@@ -56,14 +62,18 @@ class CollectConfig:
 def main(config: CollectConfig) -> None:
     """Runs the command."""
     from lerobot_pf2mp.dataset_tools.fetch_dataset import FETCH_OF_TASK
+    from lerobot_pf2mp.dataset_tools.handwriting_dataset import SPACE_OF_TASK
     from lerobot_pf2mp.dataset_tools.maze_dataset import MAZE_OF_TASK
 
     if config.maze_map is not None or config.task in MAZE_OF_TASK:
         _collect_maze(config)
     elif config.task in FETCH_OF_TASK:
         _collect_fetch(config, FETCH_OF_TASK[config.task])
+    elif config.task in SPACE_OF_TASK:
+        _collect_handwriting(config, SPACE_OF_TASK[config.task])
     else:
-        raise ValueError(f"task must be one of {[*MAZE_OF_TASK, *FETCH_OF_TASK]}, got {config.task!r}")
+        tasks = [*MAZE_OF_TASK, *FETCH_OF_TASK, *SPACE_OF_TASK]
+        raise ValueError(f"task must be one of {tasks}, got {config.task!r}")
 
 
 def _collect_maze(config: CollectConfig) -> None:
@@ -90,7 +100,7 @@ def _collect_maze(config: CollectConfig) -> None:
 def _collect_fetch(config: CollectConfig, task: str) -> None:
     from lerobot_pf2mp.dataset_tools.collect_fetch import collect_fetch
 
-    repo_id, root = dataset_place(config.repo_id, config.root, "maze" if config.maze_map else config.task)
+    repo_id, root = dataset_place(config.repo_id, config.root, config.task)
     n_steps = 48 if config.n_steps is None else config.n_steps
     n_written, dropped = collect_fetch(
         task,
@@ -105,5 +115,26 @@ def _collect_fetch(config: CollectConfig, task: str) -> None:
         n_processes=config.n_processes,
         overwrite=config.overwrite,
         expert=None if config.expert == "scripted" else Path(config.expert).expanduser(),
+    )
+    report(n_written, n_steps, dropped, root)
+
+
+def _collect_handwriting(config: CollectConfig, space: str) -> None:
+    from lerobot_pf2mp.dataset_tools.collect_handwriting import collect_handwriting
+
+    if config.expert != "scripted":
+        raise ValueError(f"expert must be scripted for handwriting, got {config.expert!r}")
+    repo_id, root = dataset_place(config.repo_id, config.root, config.task)
+    n_steps = HANDWRITING_STEPS if config.n_steps is None else config.n_steps
+    default = {"joint": 20, "pen": 10}[space]
+    n_written, dropped = collect_handwriting(
+        space,
+        root=root,
+        repo_id=repo_id,
+        n_episodes=default if config.n_episodes is None else config.n_episodes,
+        n_steps=n_steps,
+        scene_options=config.scene_options,
+        seed=config.seed,
+        overwrite=config.overwrite,
     )
     report(n_written, n_steps, dropped, root)

@@ -9,21 +9,27 @@ from typing import Any
 
 from lerobot_pf2mp.commands.command import dataset_place, report
 from lerobot_pf2mp.commands.scene import SceneConfig
+from lerobot_pf2mp.commands.writing import WritingConfig
+from lerobot_pf2mp.envs.sheet import HANDWRITING_STEPS
 
 
 @dataclass
 class SourceConfig:
     """Where recorded demonstrations come from."""
 
-    # Layout of the recording: d4rl (maze2d, one HDF5 file), minari (pointmaze, a folder) or fetch (gymnasium-robotics'
-    # FetchReach or FetchPush: an npz file, or the folder of a Minari dataset).
+    # Layout of the recording: d4rl (maze2d, one HDF5 file), minari (pointmaze, a folder), fetch (gymnasium-robotics'
+    # FetchReach or FetchPush: an npz file, or the folder of a Minari dataset) or handwriting (a CSV or JSON file, or the
+    # folder of a LeRobotDataset with joint actions).
     type: str = "d4rl"
     # The file or folder.
     path: Path | None = None
+    # Handwriting: seven angles to add to the recorded joints [rad], where the arm's zero positions are others:
+    # [0,0,0,0,0,-1.5708,-0.7854] for a real Panda.
+    joint_offsets: list[float] = field(default_factory=list)
 
 
 @dataclass
-class ConvertConfig:
+class ConvertConfig(WritingConfig):
     """Turns recorded demonstrations into a LeRobotDataset.
 
     Examples:
@@ -33,18 +39,25 @@ class ConvertConfig:
         pf2mp-convert --source.type=fetch --source.path=reach.npz --task=fetch_reach --root=data/reach
         pf2mp-convert --source.type=fetch --source.path=~/.minari/datasets/fetch/push-v0 --task=fetch_push \
 --scene.wall_position=[1.30,0.80] --root=data/push
+        pf2mp-convert --source.type=handwriting --source.path=strokes.csv --task=handwriting_pen --root=data/mine
+        pf2mp-convert --source.type=handwriting --source.path=data/teleoperated --task=handwriting_joint \
+--scene_file=my_stroke.json --root=data/mine
 
     npz files of Fetch hold, without pickles, observation (E, T+1, 10 for Reach or 25 for Push) and desired_goal (E, T+1 or
     T, 3) of E episodes. Or they hold the rows of all episodes, observation (N, 10 or 25) and desired_goal (N, 3), with
     episode_ends (E), the row after each episode's last, or terminals and timeouts (N), true in each episode's last row. An
     observation begins with the gripper's position, for Push followed by the block's [m]; an episode's last desired goal is
     its goal. Episodes that do not end within 0.05 m of it are left out.
+
+    CSV files of handwriting have columns time [s], optionally episode, and joint_1 to joint_7 [rad], optionally finger_1
+    and finger_2 [m], or x and y of the pen [m]. JSON files are {"episodes": [{"time": [...], "joints": [[7 or 9], ...]}]} or
+    "pen": [[x, y], ...] instead. Of a LeRobotDataset the actions are taken: 7 joints, or 7 joints and 2 fingers.
     """
 
     # The recording.
     source: SourceConfig = field(default_factory=SourceConfig)
-    # What was recorded: maze_umaze, maze_medium, maze_large, fetch_reach or fetch_push. Episodes that touch its walls are
-    # left out.
+    # What was recorded: maze_umaze, maze_medium, maze_large, fetch_reach, fetch_push, handwriting_joint or
+    # handwriting_pen. Episodes that touch its walls or enter its regions are left out.
     task: str = "maze_large"
     # Folder of the dataset; by default where LeRobot keeps the datasets of your Hub account.
     root: Path | None = None
@@ -52,7 +65,7 @@ class ConvertConfig:
     repo_id: str | None = None
     # Most episodes to write; all by default.
     n_episodes: int | None = None
-    # Steps that each episode is resampled to; by default 80 for a maze, 48 for Fetch.
+    # Steps that each episode is resampled to; by default 80 for a maze, 48 for Fetch, 64 for handwriting.
     n_steps: int | None = None
     # Mazes: a map of your own instead of the task's: rows of 0 (free) and 1 (wall) separated by "/".
     maze_map: str | None = None
@@ -71,18 +84,25 @@ def main(config: ConvertConfig) -> None:
         _convert_maze(config, source.path)
     elif source.type == "fetch":
         _convert_fetch(config, source.path)
+    elif source.type == "handwriting":
+        _convert_handwriting(config, source.path)
     else:
-        raise ValueError(f"--source.type must be one of ['d4rl', 'minari', 'fetch'], got {source.type!r}")
+        types = ["d4rl", "minari", "fetch", "handwriting"]
+        raise ValueError(f"--source.type must be one of {types}, got {source.type!r}")
 
 
 def _convert_maze(config: ConvertConfig, path: Path) -> None:
     from lerobot_pf2mp.dataset_tools.convert_d4rl import read_d4rl
     from lerobot_pf2mp.dataset_tools.convert_minari import read_minari
     from lerobot_pf2mp.dataset_tools.fetch_dataset import FETCH_OF_TASK
+    from lerobot_pf2mp.dataset_tools.handwriting_dataset import SPACE_OF_TASK
     from lerobot_pf2mp.dataset_tools.maze_dataset import maze_of, write_maze_dataset
 
-    if config.task in FETCH_OF_TASK:
-        raise ValueError(f"--source.type must be fetch for {config.task}, got {config.source.type!r}")
+    for tasks, source_type in ((FETCH_OF_TASK, "fetch"), (SPACE_OF_TASK, "handwriting")):
+        if config.task in tasks:
+            raise ValueError(
+                f"--source.type must be {source_type} for {config.task}, got {config.source.type!r}"
+            )
     maze = maze_of(config.task, config.maze_map)
     if config.source.type == "d4rl":
         trajectories: Any = read_d4rl(path, maze)
@@ -113,7 +133,7 @@ def _convert_fetch(config: ConvertConfig, path: Path) -> None:
         raise ValueError(f"--maze_map is for mazes only, got {config.maze_map}")
     if config.task not in FETCH_OF_TASK:
         raise ValueError(f"task must be one of {list(FETCH_OF_TASK)}, got {config.task!r}")
-    repo_id, root = dataset_place(config.repo_id, config.root, "maze" if config.maze_map else config.task)
+    repo_id, root = dataset_place(config.repo_id, config.root, config.task)
     n_steps = 48 if config.n_steps is None else config.n_steps
     n_written, dropped = convert_fetch(
         path,
@@ -122,6 +142,28 @@ def _convert_fetch(config: ConvertConfig, path: Path) -> None:
         repo_id=repo_id,
         n_steps=n_steps,
         scene_changes=asdict(config.scene),
+        n_episodes=config.n_episodes,
+        overwrite=config.overwrite,
+    )
+    report(n_written, n_steps, dropped, root)
+
+
+def _convert_handwriting(config: ConvertConfig, path: Path) -> None:
+    from lerobot_pf2mp.dataset_tools.convert_handwriting import convert_handwriting
+    from lerobot_pf2mp.dataset_tools.handwriting_dataset import SPACE_OF_TASK
+
+    if config.task not in SPACE_OF_TASK:
+        raise ValueError(f"task must be one of {list(SPACE_OF_TASK)}, got {config.task!r}")
+    repo_id, root = dataset_place(config.repo_id, config.root, config.task)
+    n_steps = HANDWRITING_STEPS if config.n_steps is None else config.n_steps
+    n_written, dropped = convert_handwriting(
+        path,
+        SPACE_OF_TASK[config.task],
+        root=root,
+        repo_id=repo_id,
+        n_steps=n_steps,
+        scene_options=config.scene_options,
+        joint_offsets=config.source.joint_offsets,
         n_episodes=config.n_episodes,
         overwrite=config.overwrite,
     )

@@ -6,7 +6,15 @@ Importing this module registers them under ``lerobot_pf2mp/<task>``; MuJoCo is i
 
 import gymnasium as gym
 
-from lerobot_pf2mp.envs.configs import FETCH_TASKS, MAZE_TASKS, PF2MPFetchEnv, PF2MPMazeEnv
+from lerobot_pf2mp.envs.configs import (
+    FETCH_TASKS,
+    HANDWRITING_TASKS,
+    MAZE_TASKS,
+    PF2MPFetchEnv,
+    PF2MPHandwritingEnv,
+    PF2MPMazeEnv,
+)
+from lerobot_pf2mp.envs.sheet import HANDWRITING_STEPS
 
 for _task, _maze in MAZE_TASKS.items():
     gym.register(
@@ -24,4 +32,19 @@ for _task, _name in FETCH_TASKS.items():
         kwargs={"task": _name},
     )
 
-__all__ = ["FETCH_TASKS", "MAZE_TASKS", "PF2MPFetchEnv", "PF2MPMazeEnv"]
+for _task, _space in HANDWRITING_TASKS.items():
+    gym.register(
+        id=f"lerobot_pf2mp/{_task}",
+        entry_point="lerobot_pf2mp.envs.handwriting:HandwritingEnv",
+        max_episode_steps=HANDWRITING_STEPS,
+        kwargs={"space": _space},
+    )
+
+__all__ = [
+    "FETCH_TASKS",
+    "HANDWRITING_TASKS",
+    "MAZE_TASKS",
+    "PF2MPFetchEnv",
+    "PF2MPHandwritingEnv",
+    "PF2MPMazeEnv",
+]

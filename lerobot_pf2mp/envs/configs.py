@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 from lerobot.configs import FeatureType, PolicyFeature
@@ -15,15 +15,38 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from lerobot_pf2mp.envs.box import Box
 from lerobot_pf2mp.envs.fetch_scene import FETCH_FPS, check_inner_steps, make_scene
+from lerobot_pf2mp.envs.sheet import (
+    HANDWRITING_FPS,
+    HANDWRITING_STEPS,
+    LETTER_HEIGHT,
+    N_REGIONS,
+    REGION_GAP,
+)
 from lerobot_pf2mp.errors import ConfigError, reported_on_the_command_line
+
+if TYPE_CHECKING:
+    from lerobot_pf2mp.envs.writing_scene import WritingScene
 
 MAZE_TASKS = {"MazeUMaze-v0": "umaze", "MazeMedium-v0": "medium", "MazeLarge-v0": "large"}
 FETCH_TASKS = {"FetchReachWall-v0": "reach", "FetchPushWall-v0": "push"}
+HANDWRITING_TASKS = {"HandwritingJoint-v0": "joint", "HandwritingPen-v0": "pen"}
 
 
 @dataclass
 class _CollisionEnv(EnvConfig):
-    """What the configurations of this package have in common."""
+    """What the configurations of this package have in common.
+
+    Args:
+        features_map: What LeRobot calls each feature; an environment need not have all of them.
+    """
+
+    features_map: dict[str, str] = field(
+        default_factory=lambda: {
+            ACTION: ACTION,
+            "agent_pos": OBS_STATE,
+            "environment_state": OBS_ENV_STATE,
+        }
+    )
 
     @property
     def package_name(self) -> str:
@@ -87,13 +110,6 @@ class PF2MPMazeEnv(_CollisionEnv):
             "environment_state": PolicyFeature(type=FeatureType.ENV, shape=(2,)),
         }
     )
-    features_map: dict[str, str] = field(
-        default_factory=lambda: {
-            ACTION: ACTION,
-            "agent_pos": OBS_STATE,
-            "environment_state": OBS_ENV_STATE,
-        }
-    )
 
     def __post_init__(self) -> None:
         """Validates the task.
@@ -151,13 +167,6 @@ class PF2MPFetchEnv(_CollisionEnv):
     n_inner_steps: int = 1
     terminate_on_success: bool = False
     render_size: int = 480
-    features_map: dict[str, str] = field(
-        default_factory=lambda: {
-            ACTION: ACTION,
-            "agent_pos": OBS_STATE,
-            "environment_state": OBS_ENV_STATE,
-        }
-    )
 
     def __post_init__(self) -> None:
         """Validates the task and its scene.
@@ -199,3 +208,77 @@ class PF2MPFetchEnv(_CollisionEnv):
             "render_mode": "rgb_array",
             "render_size": self.render_size,
         }
+
+
+@EnvConfig.register_subclass("pf2mp_handwriting")
+@dataclass
+class PF2MPHandwritingEnv(_CollisionEnv):
+    """The handwriting environments, `lerobot_pf2mp.envs.handwriting.HandwritingEnv`.
+
+    Args:
+        task: HandwritingJoint-v0 (joint positions) or HandwritingPen-v0 (places of the pen's tip).
+        fps: Control frequency [Hz], a divisor of 500.
+        episode_length: Steps after which an episode ends.
+        letter: What to write, one of `letters.LETTERS`.
+        letter_height: [m].
+        region_gap: Between the letter and the restricted regions [m].
+        n_regions: How many regions are put into the letter's bays.
+        scene_file: A JSON file with a stroke and regions of your own instead of a letter.
+        control: physics (position controllers in full physics) or exact (the arm reaches every action).
+        render_size: Width of the rendered picture [pixels].
+        camera: arm (from the side) or top (the sheet alone).
+    """
+
+    task: str | None = "HandwritingJoint-v0"
+    fps: int = HANDWRITING_FPS
+    episode_length: int = HANDWRITING_STEPS
+    letter: str = "S"
+    letter_height: float = LETTER_HEIGHT
+    region_gap: float = REGION_GAP
+    n_regions: int = N_REGIONS
+    scene_file: str | None = None
+    control: str = "physics"
+    render_size: int = 640
+    camera: str = "arm"
+
+    def __post_init__(self) -> None:
+        """Validates the task and its scene.
+
+        Raises:
+            ConfigError: If there is no such task, or the scene does not work.
+        """
+        if self.task not in HANDWRITING_TASKS:
+            raise ConfigError(f"task must be one of {list(HANDWRITING_TASKS)}, got {self.task!r}")
+        with reported_on_the_command_line():
+            _ = self.scene
+        dim = 9 if HANDWRITING_TASKS[self.task] == "joint" else 2
+        self.features = {
+            ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(dim,)),
+            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(dim,)),
+        }
+
+    @property
+    def scene(self) -> WritingScene:
+        """The letter and the regions [m]."""
+        # Imported here because LeRobot imports this file for every command.
+        from lerobot_pf2mp.envs.writing_scene import make_writing_scene
+
+        return make_writing_scene(**self._scene_options)
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """Arguments for ``gymnasium.make``."""
+        return {
+            **self._scene_options,
+            "max_episode_steps": self.episode_length,
+            "control": self.control,
+            "fps": self.fps,
+            "render_mode": "rgb_array",
+            "render_size": self.render_size,
+            "camera": self.camera,
+        }
+
+    @property
+    def _scene_options(self) -> dict[str, Any]:
+        names = ("letter", "letter_height", "region_gap", "n_regions", "scene_file")
+        return {name: getattr(self, name) for name in names}

@@ -22,6 +22,7 @@ from lerobot_pf2mp.envs.fetch_scene import (
     make_scene,
 )
 from lerobot_pf2mp.envs.headless import rendering
+from lerobot_pf2mp.envs.picture_size import picture_size_of
 
 # Fetch moves the hand by 0.05 m times its action at most; within one of its steps the hand follows about two thirds of
 # the way. With this gain and steps of at most `MAX_STEP` it stays within 2 mm of where it is sent, 4 mm in a first step.
@@ -269,14 +270,3 @@ def _close(env: weakref.ref[gym.Env]) -> None:
     alive = env()
     if alive is not None:
         alive.close()
-
-
-def picture_size_of(render_size: int) -> tuple[int, int]:
-    """Height and width of the pictures of an environment [pixels], even numbers as video encoders want them.
-
-    Raises:
-        ValueError: If the width asked for is too small.
-    """
-    if render_size < 32:
-        raise ValueError(f"render_size must be at least 32 pixels, got {render_size}")
-    return 2 * round(3 * render_size / 8), 2 * (render_size // 2)

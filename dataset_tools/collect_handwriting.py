@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Collects demonstrations in the handwriting environments."""
+
+from __future__ import annotations
+
+from collections import Counter
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from lerobot_pf2mp.dataset_tools.attempts import successful
+from lerobot_pf2mp.dataset_tools.handwriting_dataset import handwriting_spec
+from lerobot_pf2mp.dataset_tools.handwriting_expert import ScriptedScribe
+from lerobot_pf2mp.dataset_tools.write_trajectories import write_trajectories
+
+from lerobot_pf2mp.envs.handwriting import HandwritingEnv
+
+
+def collect_handwriting(
+    space: str,
+    *,
+    root: Path,
+    repo_id: str,
+    n_episodes: int,
+    n_steps: int,
+    scene_options: dict[str, Any],
+    seed: int,
+    overwrite: bool,
+) -> tuple[int, Counter[str]]:
+    """Collects successful, collision-free demonstrations of a scripted expert as a LeRobotDataset.
+
+    Args:
+        space: What states and actions are, joint or pen.
+        root: The dataset's folder.
+        repo_id: Its name, ``user/name``.
+        n_episodes: Demonstrations to write.
+        n_steps: Steps of each.
+        scene_options: Arguments of `make_writing_scene`.
+        seed: Seed of everything random.
+        overwrite: Whether a dataset already there is replaced.
+
+    Returns:
+        The number of episodes written, and the number of those left out, by reason.
+
+    Raises:
+        ValueError: If an argument breaks its rule, or the expert almost never succeeds.
+        FileExistsError: If `root` exists and `overwrite` is false.
+    """
+    if n_steps < 2:
+        raise ValueError(f"n_steps must be at least 2, got {n_steps}")
+    env = HandwritingEnv(space, **scene_options)
+    scribe = ScriptedScribe(env, n_steps, seed)
+    failed: Counter[str] = Counter()
+    origin = f"A scripted expert wrote it (seed {seed})."
+    n_written, dropped = write_trajectories(
+        successful((scribe.demonstrate(number) for number in count()), failed),
+        root=root,
+        spec=handwriting_spec(space, env.scene.name, repo_id, origin, n_steps),
+        n_steps=n_steps,
+        collides=lambda way: False,  # it has been drawn in the environment
+        n_episodes=n_episodes,
+        overwrite=overwrite,
+    )
+    return n_written, dropped + failed
