@@ -20,7 +20,7 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
 from lerobot_pf2mp import plots
-from lerobot_pf2mp.envs.configs import MAZE_TASKS, PF2MPFetchEnv, PF2MPMazeEnv
+from lerobot_pf2mp.envs.configs import MAZE_TASKS, PF2MPFetchEnv, PF2MPHandwritingEnv, PF2MPMazeEnv
 from lerobot_pf2mp.envs.point_maze import parse_maze_map
 from lerobot_pf2mp.loading import load_policy
 from lerobot_pf2mp.plots import Path2D, PathPair, Scene
@@ -30,7 +30,7 @@ from lerobot_pf2mp.prior_noise import seeded_prior_noise
 from lerobot_pf2mp.results import SummaryRow, group_cells, read_rows
 from lerobot_pf2mp.video import write_comparison
 
-FIGURES = ("lambda", "density", "arrows", "trajectories", "overview", "flow", "video")
+FIGURES = ("lambda", "density", "arrows", "trajectories", "overview", "strokes", "flow", "video")
 
 _N_SEARCHED = 100
 
@@ -106,6 +106,9 @@ class GuidedPolicyFigures:
         elif figure == "trajectories":
             pairs = self.path_pairs(n_episodes, episodes)
             plots.plot_trajectories(output, scene=scene, pairs=pairs, background=background)
+        elif figure == "strokes":
+            pairs = self.path_pairs(0, episodes or range(n_episodes))
+            plots.plot_strokes(output, scene=scene, pairs=pairs, background=background)
         elif figure == "overview":
             pair = self.path_pairs(1, episodes[:1])[0]
             plots.plot_maze_overview(output, scene=scene, pair=pair, background=background)
@@ -135,6 +138,8 @@ class GuidedPolicyFigures:
         env = self._env
         if isinstance(env, PF2MPMazeEnv):
             return Scene(self._postprocess, field, parse_maze_map(env.maze_map or MAZE_TASKS[str(env.task)]))
+        if isinstance(env, PF2MPHandwritingEnv):
+            return Scene(self._postprocess, field, writing=env.scene)
         return Scene(self._postprocess, field, obstacles=[env.wall] if isinstance(env, PF2MPFetchEnv) else ())
 
     def path_pairs(self, n_pairs: int, episodes: Sequence[int] = ()) -> list[PathPair]:
@@ -208,6 +213,14 @@ class GuidedPolicyFigures:
         self._config.guidance_scale = scale
         env_processors = make_env_pre_post_processors(self._env, self._config)
         env = self._make_env(n_episodes)
+        pens: list[np.ndarray] = []
+
+        def watch(env: Any) -> None:
+            if isinstance(self._env, PF2MPHandwritingEnv):
+                pens.append(np.array([each.unwrapped.pen[:2] for each in env.envs]))
+            if film is not None:
+                film(env)
+
         try:
             with (
                 seeded_prior_noise(self._policy, 0),
@@ -221,18 +234,18 @@ class GuidedPolicyFigures:
                     self._postprocess,
                     seeds=[self._seed + i for i in range(n_episodes)],
                     return_observations=True,
-                    render_callback=film,
+                    render_callback=watch,
                 )
         finally:
             env.close()
             self._config.guidance_scale = configured
         observations = result["observation"]
         lengths = result["done"].int().argmax(dim=1) + 1
+        # Joint positions are no way through a scene; the pen's are.
+        ways = np.stack(pens, axis=1) if pens else observations[OBS_STATE].numpy()
         paths = [
-            Path2D(positions[: length + 1].numpy(), (rewards[:length] < 0).numpy())
-            for positions, rewards, length in zip(
-                observations[OBS_STATE], result["reward"], lengths, strict=True
-            )
+            Path2D(way[: length + 1], (rewards[:length] < 0).numpy())
+            for way, rewards, length in zip(ways, result["reward"], lengths, strict=True)
         ]
         has_goals = OBS_ENV_STATE in observations
         goals = [observations[OBS_ENV_STATE][i, 0].numpy() if has_goals else None for i in range(n_episodes)]

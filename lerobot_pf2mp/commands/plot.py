@@ -19,17 +19,19 @@ class PlotConfig:
 
     lambda: collision and success rate against lambda, from --results. density, arrows: the potential field of
     --checkpoint. trajectories: episodes without and with guidance, from the same start and noise. overview: all of these
-    for a maze. flow: an animation (GIF) of chunks that move from noise to paths. video: one episode without and with
-    guidance, side by side (MP4).
+    for a maze. strokes: everything written in --n_episodes episodes, without and with guidance. flow: an animation (GIF) of
+    chunks that move from noise to paths. video: one episode without and with guidance, side by side (MP4).
 
     Examples:
         pf2mp-plot --figure=lambda --results=[results/maze_lambda] --task=MazeLarge-v0 --output=lambda.png
         pf2mp-plot --figure=density --checkpoint=outputs/maze_large/checkpoints/last/pretrained_model \
 --env.type=pf2mp_maze --env.task=MazeLarge-v0 --background=dark --output=density.png
+        pf2mp-plot --figure=strokes --checkpoint=outputs/letter/checkpoints/last/pretrained_model --n_episodes=100 \
+--env.type=pf2mp_handwriting --env.letter=S --output=strokes.png
         pf2mp-plot --figure=flow --checkpoint=you/your_pf2mp --options='{num_inference_steps: 20}' --output=flow.gif
     """
 
-    # lambda, density, arrows, trajectories, overview, flow or video.
+    # lambda, density, arrows, trajectories, overview, strokes, flow or video.
     figure: str = "overview"
     # The file to write: PNG, GIF for flow, MP4 for video.
     output: Path | None = None

@@ -197,6 +197,11 @@ class HandwritingEnv(gym.Env):
             raise gym.error.ResetNeeded("call reset() before render()")
         return self._camera.picture(self._data, self.ink)
 
+    @property
+    def pen(self) -> np.ndarray:
+        """Position ``(3,)`` of the pen's tip [m]."""
+        return self._tip.copy()
+
     def check_joints(self, joints: np.ndarray, name: str) -> None:
         """Checks that ``(..., 9)`` positions of joints [rad] and fingers [m] are within the arm's limits.
 

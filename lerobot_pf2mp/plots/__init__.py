@@ -10,6 +10,7 @@ from lerobot_pf2mp.plots.overview import plot_maze_overview
 from lerobot_pf2mp.plots.paths import Path2D, PathPair
 from lerobot_pf2mp.plots.rates import plot_lambda
 from lerobot_pf2mp.plots.scene import Scene
+from lerobot_pf2mp.plots.strokes import plot_strokes
 from lerobot_pf2mp.plots.theme import ANCHOR, COLLISION, EULER, GOAL, GUIDED, START, THEMES, Theme
 from lerobot_pf2mp.plots.trajectories import plot_trajectories
 
@@ -30,5 +31,6 @@ __all__ = [
     "plot_density",
     "plot_lambda",
     "plot_maze_overview",
+    "plot_strokes",
     "plot_trajectories",
 ]

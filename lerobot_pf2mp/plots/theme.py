@@ -20,6 +20,7 @@ GUIDED = "#2e9e62"
 EULER = "#d1495b"
 COLLISION = "#d62020"
 ANCHOR = "#d62728"
+REGION = "#e2746c"
 
 WIDTH = 9.0  # [inches]; 900 pixels, the width of a README
 _DPI = 100
