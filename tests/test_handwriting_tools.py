@@ -37,11 +37,12 @@ N_COLLECTED = 2
 AXES = {"joint": list(JOINT_NAMES), "pen": ["x", "y"]}
 LOW, HIGH = np.array(SHEET_CENTRE) - SHEET_SIDE / 2, np.array(SHEET_CENTRE) + SHEET_SIDE / 2
 
-# A straight stroke, which even two steps write, without regions, and between regions that leave 1 or 6 mm.
+# A straight stroke, which four steps write.
 STRAIGHT = [[0.45, -0.05], [0.55, -0.05]]
 
 
 def gates(opening: float) -> list[dict]:
+    """Pairs of regions on both sides of the straight stroke, and how far they are from each other [m]."""
     return [
         {"centre": [x, -0.05 + side * (0.009 + opening / 2)], "radius": 0.009}
         for x in (0.47, 0.50, 0.53)
@@ -153,18 +154,12 @@ def test_a_varied_stroke_depends_on_the_seed_and_on_nothing_else() -> None:
 
 
 @pytest.mark.parametrize("letter", LETTERS)
-def test_a_varied_stroke_stays_near_the_letter_without_following_it_exactly(letter: str) -> None:
-    stroke, ways = varied(letter, N_STEPS, 100)
+def test_a_varied_stroke_stays_near_all_of_the_letter_without_following_it_exactly(letter: str) -> None:
+    stroke, ways = varied(letter, N_STEPS, 50)
     for way in ways:
         off = distances(way, stroke)
         assert off.max() < 0.02
         assert 0.0005 < off.mean() < 0.008
-
-
-@pytest.mark.parametrize("letter", LETTERS)
-def test_all_of_the_letter_is_in_its_variations(letter: str) -> None:
-    stroke, ways = varied(letter, N_STEPS, 100)
-    for way in ways:
         assert distances(stroke, way).max() < 0.02
 
 
@@ -207,12 +202,14 @@ def test_the_pen_is_slowest_at_both_ends(letter: str) -> None:
 
 
 @pytest.mark.parametrize("letter", LETTERS)
-def test_a_varied_stroke_is_smooth(letter: str) -> None:
+def test_a_varied_stroke_has_no_jumps_and_bends_only_where_the_letter_does(letter: str) -> None:
     for way in varied(letter, 1000, 60)[1]:
         steps = np.diff(way, axis=0)
-        mean = np.linalg.norm(steps, axis=1).mean()
-        assert np.linalg.norm(steps, axis=1).max() < 3 * mean
-        assert np.linalg.norm(np.diff(steps, axis=0), axis=1).max() < 0.3 * mean
+        lengths = np.linalg.norm(steps, axis=1)
+        assert lengths.max() < 3 * lengths.mean()
+        assert np.abs(np.diff(lengths)).max() < 0.3 * lengths.mean()
+        if letter != "M":  # the corners of which are corners
+            assert np.linalg.norm(np.diff(steps, axis=0), axis=1).max() < 0.1 * lengths.mean()
 
 
 # Demonstrations
@@ -230,7 +227,7 @@ def outcome(env: HandwritingEnv, joints: np.ndarray, actions: np.ndarray) -> tup
 @pytest.mark.parametrize("space", SPACES)
 def test_demonstrations_write_the_letter_without_a_collision_under_both_controls(space: str) -> None:
     assert [each for each in demonstrations(space) if isinstance(each, str)] == ["in collision"]
-    for way, joints in zip(kept(space)[:4], kept("joint"), strict=False):
+    for way, joints in zip(kept(space)[:3], kept("joint"), strict=False):
         for control in CONTROLS:
             assert outcome(env_of(space, control), joints[0], way[1:]) == (True, False)
 
@@ -243,7 +240,7 @@ def test_a_way_that_enters_a_region_is_no_demonstration_although_the_arm_cuts_th
     number, way = max(enumerate(ways), key=lambda each: each[1][:, 0].max())  # the one that goes furthest out
     outermost = way[way[:, 0].argmax()]
     assert outermost[0] > stroke[:, 0].max() + 0.001
-    for depth, expected in ((5e-6, "in collision"), (-5e-4, None)):
+    for depth, expected in ((5e-6, "in collision"), (-0.002, None)):
         disc = {"centre": [outermost[0] + 0.01 - depth, outermost[1]], "radius": 0.01}
         scene = write_json(tmp_path / "scene.json", {"stroke": stroke.tolist(), "regions": [disc]})
         other = HandwritingEnv("joint", scene_file=scene)
@@ -260,7 +257,7 @@ def test_no_demonstration_leaves_the_sheet(space: str) -> None:
     for attempt in attempts:
         if isinstance(attempt, Trajectory):
             places = attempt.positions if space == "pen" else forward(attempt.positions)[0][:, :2]
-            assert np.all((places >= LOW) & (places <= HIGH)), places
+            assert np.all((places >= LOW - 1e-5) & (places <= HIGH + 1e-5))
     # Variations are a few millimetres, and so is the margin.
     ways = [vary(env.scene.stroke, 16, np.random.default_rng([0, number])) for number in range(8)]
     assert any((way < LOW).any() or (way > HIGH).any() for way in ways)
@@ -458,7 +455,7 @@ def test_an_interruption_of_collecting_leaves_nothing_behind(
 
 
 def test_a_dataset_is_not_replaced_by_collecting_unless_asked_for(tmp_path: Path) -> None:
-    small = {"n_steps": 2, "scene_options": straight(tmp_path)}
+    small = {"n_steps": 4, "scene_options": straight(tmp_path)}
     collect("pen", tmp_path / "d", n_episodes=2, **small)
     with pytest.raises(FileExistsError, match="exists already: .*--overwrite=true"):
         collect("pen", tmp_path / "d", n_episodes=3, **small)
@@ -972,7 +969,8 @@ def test_joints_that_hold_the_pen_off_the_sheet_are_refused_for_a_dataset_of_the
 
 
 def test_recordings_without_a_usable_episode_are_refused_with_the_reasons(tmp_path: Path) -> None:
-    through = np.linspace(*(np.array(env_of("joint").scene.regions[0].centre) + [[-0.01, 0], [0.01, 0]]), 4)
+    x, y = env_of("joint").scene.regions[0].centre
+    through = np.linspace([x - 0.01, y], [x + 0.01, y], 4)
     lifted = joints_at(np.linspace(*STRAIGHT, 4), height=0.02)
     path = in_json(tmp_path / "others.json", through, lifted, through)
     with pytest.raises(
@@ -1039,9 +1037,9 @@ def test_the_command_collects_a_stroke_of_your_own_with_the_pen(
     tmp_path: Path, command: Callable[..., str]
 ) -> None:
     scene, root = straight(tmp_path)["scene_file"], tmp_path / "d"
-    options = ("--task=handwriting_pen", f"--scene_file={scene}", "--n_steps=2", f"--root={root}")
-    assert command(cli.collect, *options) == f"Wrote 10 episodes of 2 steps to {root} (left out: none)."
-    assert frames_of(root)["action"].shape == (10, 2, 2)
+    options = ("--task=handwriting_pen", f"--scene_file={scene}", "--n_steps=4", f"--root={root}")
+    assert command(cli.collect, *options) == f"Wrote 10 episodes of 4 steps to {root} (left out: none)."
+    assert frames_of(root)["action"].shape == (10, 4, 2)
     assert "Write straight without" in (root / "README.md").read_text()
     assert command(cli.collect, *options).startswith(f"error: {root} exists already")
 
@@ -1079,9 +1077,9 @@ def test_a_scene_file_may_be_given_below_the_home_folder(
 ) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     straight(tmp_path)
-    options = ("--task=handwriting_pen", "--scene_file=~/straight.json", "--n_steps=2", "--n_episodes=1")
+    options = ("--task=handwriting_pen", "--scene_file=~/straight.json", "--n_steps=4", "--n_episodes=1")
     line = command(cli.collect, *options, f"--root={tmp_path / 'd'}")
-    assert line == f"Wrote 1 episodes of 2 steps to {tmp_path / 'd'} (left out: none)."
+    assert line == f"Wrote 1 episodes of 4 steps to {tmp_path / 'd'} (left out: none)."
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from lerobot_pf2mp.envs.stroke import evenly_spaced
 
 # lookat [m], distance [m], azimuth and elevation [degrees]; whether the arm is shown
 CAMERAS = {
-    "arm": ((0.38, 0.0, 0.17), 1.2, 130.0, -34.0, True),
+    "arm": ((0.40, 0.0, 0.13), 1.02, 130.0, -34.0, True),
     "top": ((*SHEET_CENTRE, 0.0), 0.42, 90.0, -89.9, False),
 }
 
