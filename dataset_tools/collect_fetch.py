@@ -58,7 +58,8 @@ def collect_fetch(
         n_processes: Processes side by side.
         overwrite: Whether a dataset already there is replaced.
         expert: Folder of an expert that `train_expert` wrote; None is the scripted one.
-        picture_width: Width of a camera's pictures [pixels], their height is three quarters of it; None for no camera.
+        picture_width: Width of a camera's pictures [pixels], their height is three quarters of it, which are recorded
+            instead of the places of block and goal; None for no camera.
 
     Returns:
         The number of episodes written, and the number of those left out, by reason.

@@ -14,6 +14,7 @@ from lerobot_pf2mp.dataset_tools.handwriting_expert import ScriptedScribe
 from lerobot_pf2mp.dataset_tools.write_trajectories import write_trajectories
 
 from lerobot_pf2mp.envs.handwriting import HandwritingEnv
+from lerobot_pf2mp.envs.picture_size import picture_size_of
 
 
 def collect_handwriting(
@@ -26,6 +27,7 @@ def collect_handwriting(
     scene_options: dict[str, Any],
     seed: int,
     overwrite: bool,
+    picture_width: int | None = None,
 ) -> tuple[int, Counter[str]]:
     """Collects successful, collision-free demonstrations of a scripted expert as a LeRobotDataset.
 
@@ -38,6 +40,7 @@ def collect_handwriting(
         scene_options: Arguments of `make_writing_scene`.
         seed: Seed of everything random.
         overwrite: Whether a dataset already there is replaced.
+        picture_width: Width of a camera's pictures [pixels], their height is three quarters of it; None for no camera.
 
     Returns:
         The number of episodes written, and the number of those left out, by reason.
@@ -48,14 +51,18 @@ def collect_handwriting(
     """
     if n_steps < 2:
         raise ValueError(f"n_steps must be at least 2, got {n_steps}")
-    env = HandwritingEnv(space, **scene_options)
+    options, picture_size = dict(scene_options), None
+    if picture_width is not None:
+        options |= {"render_mode": "rgb_array", "render_size": picture_width}
+        picture_size = picture_size_of(picture_width)
+    env = HandwritingEnv(space, **options)
     scribe = ScriptedScribe(env, n_steps, seed)
     failed: Counter[str] = Counter()
     origin = f"A scripted expert wrote it (seed {seed})."
     n_written, dropped = write_trajectories(
         successful((scribe.demonstrate(number) for number in count()), failed),
         root=root,
-        spec=handwriting_spec(space, env.scene.name, repo_id, origin, n_steps),
+        spec=handwriting_spec(space, env.scene.name, repo_id, origin, n_steps, picture_size),
         n_steps=n_steps,
         collides=lambda way: False,  # it has been drawn in the environment
         n_episodes=n_episodes,

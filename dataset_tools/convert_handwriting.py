@@ -62,7 +62,7 @@ def convert_handwriting(
     recordings = read_handwriting(path, joint_offsets)
     left_out: Counter[str] = Counter()
     n_written, dropped = write_trajectories(
-        _usable(recordings, env, space, n_steps, left_out),
+        _usable(path, recordings, env, space, n_steps, left_out),
         root=root,
         spec=handwriting_spec(
             space, env.scene.name, repo_id, f"Converted from {path.name} (handwriting).", n_steps
@@ -77,12 +77,14 @@ def convert_handwriting(
 
 
 def _usable(
+    path: Path,
     recordings: Sequence[HandwritingRecording],
     env: HandwritingEnv,
     space: str,
     n_steps: int,
     left_out: Counter[str],
 ) -> Iterator[Trajectory]:
+    n_usable = 0
     for recording in recordings:
         joints, places, heights = _ways(recording, env, n_steps)
         if (np.abs(heights) > INK_HEIGHT).any():
@@ -90,7 +92,15 @@ def _usable(
         elif _collides(env, joints):
             left_out["in collision"] += 1
         else:
+            if space == "pen":
+                check_on_sheet(places, f"the pen in {recording.name}")
+            n_usable += 1
             yield Trajectory(joints if space == "joint" else places)
+    if not n_usable:
+        reasons = ", ".join(f"{number} {reason}" for reason, number in left_out.items())
+        raise ValueError(
+            f"a dataset must hold at least one episode, got none that is usable in {path} (left out: {reasons})"
+        )
 
 
 def _ways(

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 MIN_STEPS = 2
-PICTURES = "observation.images.camera"
+PICTURES = "observation.image"
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from __future__ import annotations
 from typing import Any
 
 from lerobot_pf2mp.dataset_tools.episodes import PICTURES
-from lerobot_pf2mp.dataset_tools.lerobot_writer import DatasetSpec
+from lerobot_pf2mp.dataset_tools.lerobot_writer import DatasetSpec, picture_feature
 
 FPS = 25
 FETCH_OF_TASK = {"fetch_reach": "reach", "fetch_push": "push"}
@@ -33,9 +33,9 @@ Every demonstration is resampled to {n_steps} steps by linear interpolation in t
 | feature | meaning | unit |
 |---|---|---|
 | `observation.state` | position x, y, z of the gripper | m |
-| `observation.environment_state` | positions x, y, z of {places} | m |
+| `observation.environment_state` | positions x, y, z of {places}, unless there is a camera | m |
 | `action` | next position x, y, z of the gripper | m |
-| `observation.images.camera` | if present: the scene, from in front of the table | |
+| `observation.image` | if present: the scene, from in front of the table | |
 
 x points away from the robot, y to its left, z up; the table's top is at z = 0.40 m. Made with lerobot_policy_pf2mp.
 """
@@ -51,7 +51,7 @@ def fetch_spec(
         repo_id: The dataset's name, ``user/name``.
         origin: A sentence for the card: where the demonstrations come from.
         n_steps: Steps that each is resampled to.
-        picture_size: Height and width of the camera's pictures [pixels]; None without a camera.
+        picture_size: Height and width of the pictures that are recorded instead of places [pixels]; None for places.
     """
     description = TASK_DESCRIPTIONS[task]
     places = " and ".join(_PLACES[task])
@@ -60,8 +60,8 @@ def fetch_spec(
     )
     features = _features_of(task)
     if picture_size is not None:
-        shape = (*picture_size, 3)
-        features[PICTURES] = {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"]}
+        del features["observation.environment_state"]
+        features[PICTURES] = picture_feature(picture_size)
     return DatasetSpec(repo_id, FPS, features, description, card)
 
 

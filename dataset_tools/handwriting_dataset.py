@@ -5,7 +5,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from lerobot_pf2mp.dataset_tools.lerobot_writer import DatasetSpec
+from lerobot_pf2mp.dataset_tools.episodes import PICTURES
+from lerobot_pf2mp.dataset_tools.lerobot_writer import DatasetSpec, picture_feature
 
 from lerobot_pf2mp.envs.panda import JOINT_NAMES
 from lerobot_pf2mp.envs.sheet import HANDWRITING_FPS
@@ -34,12 +35,20 @@ Every demonstration has {n_steps} steps; {fps} fps.
 |---|---|
 | `observation.state` | {meaning} |
 | `action` | the next ones |
+| `observation.image` | if present: arm and sheet from the side |
 
 The frame is that of the arm's base: x forward, y to its left. Made with lerobot_policy_pf2mp.
 """
 
 
-def handwriting_spec(space: str, name: str, repo_id: str, origin: str, n_steps: int) -> DatasetSpec:
+def handwriting_spec(
+    space: str,
+    name: str,
+    repo_id: str,
+    origin: str,
+    n_steps: int,
+    picture_size: tuple[int, int] | None = None,
+) -> DatasetSpec:
     """What a handwriting dataset holds besides its episodes.
 
     Args:
@@ -48,6 +57,7 @@ def handwriting_spec(space: str, name: str, repo_id: str, origin: str, n_steps: 
         repo_id: The dataset's name, ``user/name``.
         origin: A sentence for the card: where the demonstrations come from.
         n_steps: Steps that each has.
+        picture_size: Height and width of a camera's pictures [pixels]; None without a camera.
     """
     description = f"Write {name} without entering a red region."
     card = _CARD.format(
@@ -61,4 +71,6 @@ def handwriting_spec(space: str, name: str, repo_id: str, origin: str, n_steps: 
     names = _NAMES[space]
     feature: dict[str, Any] = {"dtype": "float32", "shape": (len(names),), "names": names}
     features = {"observation.state": feature, "action": dict(feature)}
+    if picture_size is not None:
+        features[PICTURES] = picture_feature(picture_size)
     return DatasetSpec(repo_id, HANDWRITING_FPS, features, description, card)

@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from lerobot_pf2mp.envs.handwriting import START_SPREAD, HandwritingEnv
 from lerobot_pf2mp.envs.stroke import evenly_spaced
+from lerobot_pf2mp.envs.writing_scene import is_on_sheet
 
 _SPACING = 0.001  # of the places on a stroke [m]
 # Standard deviations, except where said otherwise.
@@ -29,6 +30,8 @@ _TEMPO = 0.15  # of the logarithm of the speed
 _LARGEST_RADIUS = 0.08  # [m]
 _SLOWEST = 0.25  # at the ends, relative
 _RAMP = 0.08  # share of the stroke
+# Of the places to the regions [m]: between two actions the pen leaves the straight line by up to 0.03 mm.
+_CLEARANCE = 0.0001
 
 
 class ScriptedScribe:
@@ -48,18 +51,24 @@ class ScriptedScribe:
         env = self._env
         rng = np.random.default_rng([self._seed, number])
         places = vary(env.scene.stroke, self._n_steps, rng)
-        try:
-            joints = env.kinematics.way(places)
-        except ValueError:
-            return "out of reach"
+        if not is_on_sheet(places):
+            return "off the sheet"
+        # In full physics the arm cuts corners; the actions themselves must be clear, too.
+        if env.scene.clearance(places) < _CLEARANCE:
+            return "in collision"
+        joints = env.kinematics.way(places)
         way = joints if env.action_space.shape == joints.shape[1:] else places
         env.reset(options={"joints": joints[0]})
         info: dict[str, Any] = {}
+        pictures = [env.render()]
         for target in way[1:]:
             _, _, _, _, info = env.step(target)
+            pictures.append(env.render())
         if info["is_collision"]:
             return "in collision"
-        return Trajectory(way) if info["is_success"] else "without success"
+        if not info["is_success"]:
+            return "without success"
+        return Trajectory(way, pictures=None if env.render_mode is None else np.array(pictures))
 
 
 def vary(stroke: np.ndarray, n_steps: int, rng: np.random.Generator) -> np.ndarray:

@@ -17,12 +17,14 @@ import csv
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lerobot_pf2mp.envs.panda import GRIP, JOINT_NAMES, N_ARM_JOINTS
+from lerobot_pf2mp.errors import explained
 
 _MIN_SAMPLES = 3
 
@@ -101,6 +103,8 @@ def read_handwriting(path: Path, joint_offsets: Sequence[float] = ()) -> list[Ha
         if values.shape[1] == len(JOINT_NAMES):
             values = values + offsets
         recordings.append(HandwritingRecording(times, values, f"{name} of {path}"))
+    if len(joint_offsets) and not any(each.values.shape[1] == len(JOINT_NAMES) for each in recordings):
+        raise ValueError(f"joint_offsets are for recordings of joints, got one of the pen: {path}")
     if not recordings:
         raise ValueError(f"{path} must hold at least one episode, got none")
     return recordings
@@ -110,10 +114,12 @@ _Episode = tuple[str, np.ndarray, np.ndarray]
 
 
 def _read_csv(path: Path) -> list[_Episode]:
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        reader = csv.DictReader(file, skipinitialspace=True)
-        columns = list(reader.fieldnames or [])
-        rows = list(reader)
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            columns, *lines = [[cell.strip() for cell in line] for line in csv.reader(file) if line] or [[]]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{path} must be a CSV file in UTF-8, got {error}") from error
+    rows = [dict(zip_longest(columns, line)) for line in lines]
     names = _value_columns(columns, path)
     try:
         numbers = np.array(
@@ -155,7 +161,7 @@ def _json_episode(content: Any, number: int, path: Path) -> _Episode:
             try:
                 times = np.array(content["time"], dtype=np.float64)
                 values = np.array(content[key], dtype=np.float64)
-            except (TypeError, ValueError):
+            except (TypeError, ValueError, OverflowError):
                 break
             if times.ndim == 1 and values.ndim == 2 and values.shape[1] in widths:
                 return f"episode {number}", times, values
@@ -170,7 +176,8 @@ def _read_dataset(path: Path) -> list[_Episode]:
 
     if not (path / "meta" / "info.json").is_file():
         raise ValueError(f"{path} must be the folder of a LeRobotDataset, got one without meta/info.json")
-    table = LeRobotDataset(f"local/{path.name}", root=path).hf_dataset.with_format("numpy")
+    with explained(f"{path} cannot be read as a LeRobotDataset"):
+        table = LeRobotDataset(f"local/{path.name}", root=path).hf_dataset.with_format("numpy")
     actions = np.asarray(table["action"][:], dtype=np.float64) if "action" in table.column_names else None
     if actions is None or actions.ndim != 2 or actions.shape[1] not in (N_ARM_JOINTS, len(JOINT_NAMES)):
         found = None if actions is None else actions.shape[1:]

@@ -21,6 +21,11 @@ from lerobot.utils.utils import flatten_dict
 from lerobot_pf2mp.written_beside import written_beside
 
 
+def picture_feature(picture_size: tuple[int, int]) -> dict[str, Any]:
+    """The feature of a camera whose pictures have a height and a width [pixels]."""
+    return {"dtype": "video", "shape": (*picture_size, 3), "names": ["height", "width", "channels"]}
+
+
 @dataclass(frozen=True)
 class DatasetSpec:
     """What a dataset holds besides its episodes.

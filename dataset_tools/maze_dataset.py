@@ -4,13 +4,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
-from lerobot_pf2mp.dataset_tools.episodes import Trajectory
-from lerobot_pf2mp.dataset_tools.lerobot_writer import DatasetSpec
+import numpy as np
+from lerobot_pf2mp.dataset_tools.episodes import PICTURES, Trajectory, resample
+from lerobot_pf2mp.dataset_tools.lerobot_writer import DatasetSpec, picture_feature
 from lerobot_pf2mp.dataset_tools.write_trajectories import write_trajectories
 
+from lerobot_pf2mp.envs.maze_picture import MazePicture
 from lerobot_pf2mp.envs.point_maze import BALL_RADIUS, make_point_maze
 from lerobot_pf2mp.envs.swept_ball import SweptBall
 
@@ -39,8 +42,9 @@ Every trajectory is resampled to {n_steps} steps by linear interpolation in time
 | feature | meaning | unit |
 |---|---|---|
 | `observation.state` | position x, y of the ball | m |
-| `observation.environment_state` | position x, y of the goal | m |
+| `observation.environment_state` | position x, y of the goal, unless there are pictures | m |
 | `action` | next position x, y of the ball | m |
+| `observation.image` | if present: the maze from above | |
 
 The origin is the centre of the map, x points east and y north; cells have sides of 1 m, the ball a radius of 0.1 m.
 Made with lerobot_policy_pf2mp.
@@ -71,6 +75,7 @@ def write_maze_dataset(
     n_episodes: int | None = None,
     n_expected: int | None = None,
     overwrite: bool = False,
+    picture_width: int | None = None,
 ) -> tuple[int, Counter[str]]:
     """Writes the usable ones of some trajectories in a maze as a LeRobotDataset.
 
@@ -78,15 +83,35 @@ def write_maze_dataset(
     environment [m]. Besides, there is `repo_id`, the dataset's name ``user/name``; `maze`, as for `parse_maze_map`, whose
     walls a trajectory must not touch; and `origin`, a sentence for the card: where the trajectories come from.
     """
-    _, model = make_point_maze(maze)
+    point_maze, model = make_point_maze(maze)
+    features: dict[str, Any] = dict(_FEATURES)
+    if picture_width is not None:
+        picture = MazePicture(point_maze.maze.maze_map, picture_width)
+        trajectories = _with_pictures(trajectories, picture, n_steps)
+        del features["observation.environment_state"]
+        features[PICTURES] = picture_feature(picture.size)
     card = _CARD.format(title=repo_id, origin=origin, n_steps=n_steps, fps=FPS)
     return write_trajectories(
         trajectories,
         root=root,
-        spec=DatasetSpec(repo_id, FPS, _FEATURES, TASK_DESCRIPTION, card),
+        spec=DatasetSpec(repo_id, FPS, features, TASK_DESCRIPTION, card),
         n_steps=n_steps,
         collides=SweptBall(model, BALL_RADIUS).collides,
         n_episodes=n_episodes,
         n_expected=n_expected,
         overwrite=overwrite,
     )
+
+
+def _with_pictures(
+    trajectories: Iterable[Trajectory], picture: MazePicture, n_steps: int
+) -> Iterator[Trajectory]:
+    """The trajectories, resampled, with what the environment would show on the way."""
+    for trajectory in trajectories:
+        assert trajectory.goal is not None  # there is one in every maze
+        way = resample(trajectory.positions, n_steps)
+        pictures = [
+            picture.draw(ball=way[i], goal=trajectory.goal, path=way[: i + 1], collisions=())
+            for i in range(len(way))
+        ]
+        yield Trajectory(way, trajectory.goal, pictures=np.array(pictures))

@@ -32,7 +32,7 @@ def write_trajectories(
     Args:
         trajectories: The trajectories.
         root: The dataset's folder.
-        spec: What the dataset holds besides its episodes.
+        spec: What the dataset holds besides its episodes; of these the features that it names are written.
         n_steps: Steps T that each trajectory is resampled to.
         collides: Whether a ``(T + 1, D)`` way touches an obstacle; such trajectories are left out.
         n_episodes: Most episodes to write; None writes all.
@@ -51,7 +51,8 @@ def write_trajectories(
     if n_episodes is not None and n_episodes < 1:
         raise ValueError(f"n_episodes must be at least 1, got {n_episodes}")
     dropped: Counter[str] = Counter()
-    usable = islice(prepare(trajectories, n_steps, collides, dropped), n_episodes)
+    prepared = prepare(trajectories, n_steps, collides, dropped)
+    usable = islice(({key: frames[key] for key in spec.features} for frames in prepared), n_episodes)
     # Closed here rather than by the garbage collector, so that an interrupted bar is not drawn again at the end.
     with closing(_with_progress(usable, n_episodes or n_expected)) as episodes:
         write = write_video_dataset if has_pictures(spec) else write_dataset

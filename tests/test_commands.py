@@ -556,13 +556,17 @@ def test_collect_takes_demonstrations_in_fetch(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        (["--obs_type=pixels"], "error: obs_type must be one of ['state', 'pixels_agent_pos'], got 'pixels'"),
         (["--style=fast"], "error: style must be one of ['clear', 'hug'], got 'fast'"),
         (["--n_processes=0"], "error: n_processes must be at least 1, got 0"),
         (["--scene.wall_size=[0.3,0.04,0.9]"], "error: a wall must be at most 0.32 m high"),
         (["--scene.wall_position=[9,9]"], "error: a wall must stand on the table"),
         (["--scene.goal_range=[[1,2],[3,4]]"], "error: goal_range must be two corners of 3 coordinates"),
         (["--scene.wall_size=tall"], "error: `scene.wall_size`"),
-        (["--picture_width=3"], "error: render_size must be at least 32 pixels, got 3"),
+        (
+            ["--obs_type=pixels_agent_pos", "--picture_width=3"],
+            "error: render_size must be at least 32 pixels, got 3",
+        ),
         (["--expert=nowhere"], "error: nowhere must be a folder written by pf2mp-train-expert"),
     ],
 )

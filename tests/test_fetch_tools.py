@@ -1202,7 +1202,7 @@ def test_the_command_writes_48_steps_and_says_what_was_left_out(
         (["--source.type=minari"], "error: --source.type must be fetch for fetch_reach, got 'minari'"),
         (
             ["--source.type=rlds"],
-            "error: --source.type must be one of ['d4rl', 'minari', 'fetch'], got 'rlds'",
+            "error: --source.type must be one of ['d4rl', 'minari', 'fetch', 'handwriting'], got 'rlds'",
         ),
         (
             ["--source.path=no.npz"],

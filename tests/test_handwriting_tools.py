@@ -249,6 +249,19 @@ def test_a_way_that_enters_a_region_is_no_demonstration_although_the_arm_cuts_th
         assert (result if isinstance(result, str) else None) == expected
 
 
+def test_a_way_from_which_the_arm_strays_into_a_region_is_in_collision(tmp_path: Path) -> None:
+    env, n_steps = HandwritingEnv("pen", n_regions=0), 12  # so fast that it lags behind
+    way = ScriptedScribe(env, n_steps, seed=0).demonstrate(0).positions
+    drawn = np.concatenate(env.ink.strokes)
+    away = np.minimum(distances(drawn, way), distances(drawn, env.scene.stroke))
+    assert away.max() > 0.0025
+    disc = {"centre": drawn[away.argmax()].tolist(), "radius": away.max() - 0.001}
+    scene = write_json(tmp_path / "scene.json", {"stroke": env.scene.stroke.tolist(), "regions": [disc]})
+    other = HandwritingEnv("pen", scene_file=scene)
+    assert other.scene.clearance(way) > 0.0009
+    assert ScriptedScribe(other, n_steps, seed=0).demonstrate(0) == "in collision"
+
+
 @pytest.mark.parametrize("space", SPACES)
 def test_no_demonstration_leaves_the_sheet(space: str) -> None:
     env = HandwritingEnv(space, "O", letter_height=0.31, n_regions=0)
@@ -280,8 +293,10 @@ def test_in_demonstrations_the_fingers_hold_the_pen_upright_on_the_table() -> No
         assert np.abs(directions - [0, 0, -1]).max() < 0.01
 
 
-def test_joints_and_places_of_a_demonstration_are_the_same_way() -> None:
+def test_joints_and_places_of_a_demonstration_are_the_same_way_along_the_letter() -> None:
+    stroke = env_of("pen").scene.stroke
     for joints, places in zip(kept("joint"), kept("pen"), strict=True):
+        assert np.abs(places[[0, -1]] - stroke[[0, -1]]).max() <= START_SPREAD + 1e-12
         np.testing.assert_allclose(forward(joints)[0][:, :2], places, rtol=0, atol=1e-5)
 
 
@@ -796,6 +811,7 @@ def test_csv_files_with_a_row_that_is_too_short_are_refused(tmp_path: Path) -> N
         b'time,x,y\n"' + b"a" * 200_000,
         bytes(range(256)),
     ],
+    ids=["utf-16", "latin-1", "endless field", "binary"],
 )
 def test_files_that_are_not_csv_are_refused_and_named(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "others.csv").write_bytes(content)
@@ -887,7 +903,7 @@ def test_datasets_without_actions_of_joints_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_dataset_with_one_number_for_action_is_refused(tmp_path: Path) -> None:
-    path = teleoperated(tmp_path / "a", [np.zeros((4, 1))])
+    path = teleoperated(tmp_path / "a", [np.zeros((7, 1))])  # as many as there are joints
     with pytest.raises(ValueError, match="must be 7 joint positions or 9 with fingers, got"):
         read_handwriting(path)
 
@@ -1025,7 +1041,7 @@ def test_the_command_collects_a_letter_in_joints(tmp_path: Path, command: Callab
     line = command(cli.collect, *options, "--n_episodes=2", "--seed=4", f"--root={root}")
     assert line == f"Wrote 2 episodes of 64 steps to {root} (left out: none)."
     dataset = LeRobotDataset("local/handwriting_joint", root=root)
-    assert dataset.repo_id == "local/handwriting_joint"
+    assert "# local/handwriting_joint" in (root / "README.md").read_text()
     assert dataset.features["action"]["names"] == AXES["joint"]
     assert dataset[0]["task"] == "Write 8 without entering a red region."
     env = HandwritingEnv("joint", "8", letter_height=0.15, n_regions=1)

@@ -49,7 +49,8 @@ def bends_of(points: np.ndarray) -> np.ndarray:
 def densely(way: np.ndarray, spacing: float = 0.0001) -> np.ndarray:
     """``(M, 2)`` points on the line through others ``(N, 2)``, without Shapely."""
     parts = [
-        start + np.linspace(0, 1, max(2, math.ceil(math.dist(start, end) / spacing) + 1))[:, None] * (end - start)
+        start
+        + np.linspace(0, 1, max(2, math.ceil(math.dist(start, end) / spacing) + 1))[:, None] * (end - start)
         for start, end in itertools.pairwise(way)
     ]
     return np.concatenate(parts) if parts else way
@@ -104,7 +105,7 @@ def test_a_letter_passes_the_points_of_the_font_in_their_order(letter: str) -> N
     offsets, passed = points - points.mean(axis=0), passed - passed.mean(axis=0)
     size = (offsets * passed).sum() / (offsets * offsets).sum()
     np.testing.assert_allclose(passed, size * offsets, atol=1e-12)
-    assert 0.97 < size <= 1 + 1e-12  # the curve swings out by at most 3%
+    assert 0.99 < size <= 1 + 1e-12  # the curve swings out by at most 1%
 
 
 @pytest.mark.parametrize("letter", LETTERS)
@@ -138,7 +139,9 @@ def test_a_letter_that_does_not_exist_is_refused_with_the_choices(letter: Any) -
 def test_evenly_spaced_points_keep_the_ends_and_stay_on_the_line() -> None:
     rng = np.random.default_rng(0)
     for n, spacing in itertools.product((2, 3, 8), (0.001, 0.013, 0.3)):
-        corners = np.cumsum(rng.uniform((0.01, -0.1), 0.1, size=(n, 2)), axis=0)  # x grows: it never crosses itself
+        corners = np.cumsum(
+            rng.uniform((0.01, -0.1), 0.1, size=(n, 2)), axis=0
+        )  # x grows: it never crosses itself
         points = evenly_spaced(corners, spacing)
         np.testing.assert_allclose(points[[0, -1]], corners[[0, -1]], atol=1e-12)
         assert to_segments(points, corners).max() < 1e-12
@@ -287,7 +290,8 @@ def test_what_describes_no_region_is_refused_with_both_forms(content: Any) -> No
         ),
         ({"corners": [[0.4, 0.0, 0.0]] * 3}, "at least three finite places x, y .* got"),
         ({"corners": []}, "at least three finite places x, y .* got"),
-        ({"corners": [[0.4, 0.0], [0.5, 0.1], [0.4, 0.1], [0.5, 0.0]]}, "not cross itself, got"),
+        ({"corners": [[0.4, 0.0], [0.5, 0.1], [0.4, 0.1], [0.55, 0.0]]}, "not cross itself, got"),
+        ({"corners": [[0.4, 0.0], [0.4005, 0.0], [0.4, 0.0005]]}, "must have an inside .* got"),
         ({"corners": [[0.4, 0.0], [0.5, 0.0], [0.6, 0.0]]}, "must have an inside .* got"),
     ],
     ids=str,
@@ -324,7 +328,9 @@ def test_the_regions_of_a_letter_keep_the_gap_from_its_stroke_and_from_each_othe
         placed: list[Region] = []
         for region in scene.regions:
             gaps = [region.clearance(scene.stroke)]
-            gaps += [math.dist(region.centre, other.centre) - region.radius - other.radius for other in placed]
+            gaps += [
+                math.dist(region.centre, other.centre) - region.radius - other.radius for other in placed
+            ]
             assert min(gaps) >= gap - 1e-9
             # It fills the room that it has.
             assert min(gaps) == pytest.approx(gap, abs=1e-9) or region.radius == RADII[1]
@@ -376,7 +382,10 @@ def test_the_clearance_of_a_scene_is_that_of_its_nearest_region() -> None:
         ({"letter_height": NAN}, "letter_height must be above 0 m, got nan"),
         ({"letter_height": INFINITE}, "letter_height must be above 0 m, got inf"),
         ({"letter_height": 0.008}, "must be at least 0.02 m long"),
-        ({"letter_height": 0.325}, r"the stroke of S must lie on the sheet, .* x in \[0.34, 0.66\] .*; got \[0"),
+        (
+            {"letter_height": 0.325},
+            r"the stroke of S must lie on the sheet, .* x in \[0.34, 0.66\] .*; got \[0",
+        ),
         ({"region_gap": 0.0}, "region_gap must be above 0 m, got 0.0"),
         ({"region_gap": -0.01}, "region_gap must be above 0 m, got -0.01"),
         ({"region_gap": NAN}, "region_gap must be above 0 m, got nan"),
@@ -405,7 +414,9 @@ def test_the_sheet_ends_at_its_border() -> None:
         for axis in (0, 1):
             outside = border.copy()
             outside[axis] += 1e-6 * np.sign(corner[axis])
-            with pytest.raises(ValueError, match="start must lie on the sheet, where the arm reaches .*; got"):
+            with pytest.raises(
+                ValueError, match="start must lie on the sheet, where the arm reaches .*; got"
+            ):
                 check_on_sheet(outside, "start")
 
 
@@ -466,9 +477,15 @@ def test_a_file_may_leave_out_the_regions(tmp_path: Path) -> None:
         ({"stroke": "S"}, "the stroke in .*mine.json must be two or more finite places"),
         ({"stroke": None}, "the stroke in .*mine.json must be two or more finite places"),
         ({"stroke": [[0.5, 0.0], [0.5]]}, "the stroke in .*mine.json must be two or more finite places"),
-        ({"stroke": [[0.5, 0.0], [0.5, None]]}, "the stroke in .*mine.json must be two or more finite places"),
+        (
+            {"stroke": [[0.5, 0.0], [0.5, None]]},
+            "the stroke in .*mine.json must be two or more finite places",
+        ),
         ({"stroke": [[0.5, 0.0], [NAN, 0.1]]}, "the stroke in .*mine.json must be two or more finite places"),
-        ({"stroke": [[0.5, 0, 0], [0.5, 0.1, 0]]}, "the stroke in .*mine.json must be two or more finite places"),
+        (
+            {"stroke": [[0.5, 0, 0], [0.5, 0.1, 0]]},
+            "the stroke in .*mine.json must be two or more finite places",
+        ),
         ({"stroke": [[0.5, 0.0], [0.5, 0.2]]}, "the stroke of mine must lie on the sheet"),
         ({"stroke": [[0.5, 0.0], [0.5, 0.019]]}, "a stroke must be at least 0.02 m long, got that of mine"),
         ({"stroke": [[0.5, 0.0], [0.5, 0.0]]}, "a stroke must be at least 0.02 m long, got that of mine"),

@@ -7,8 +7,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from lerobot_pf2mp.commands.command import dataset_place, report
+from lerobot_pf2mp.commands.publishing import published_if_asked
 from lerobot_pf2mp.commands.scene import SceneConfig
 from lerobot_pf2mp.commands.writing import WritingConfig
+from lerobot_pf2mp.envs.configs import OBS_TYPES
 from lerobot_pf2mp.envs.sheet import HANDWRITING_STEPS
 
 
@@ -19,6 +21,7 @@ class CollectConfig(WritingConfig):
     Examples:
         pf2mp-collect --task=maze_large --root=data/maze_large
         pf2mp-collect --task=maze_medium --n_episodes=500 --action_noise=0.5 --seed=1 --root=data/noisy
+        pf2mp-collect --task=maze_large --repo_id=you/maze_large --push_to_hub=true
         pf2mp-collect --maze_map=1111111/1000001/1011101/1000001/1111111 --root=data/ring
         pf2mp-collect --task=fetch_push --style=hug --n_processes=2 --root=data/fetch_push_hug
         pf2mp-collect --task=fetch_reach --scene.wall_size=[0.3,0.04,0.25] --root=data/high_wall
@@ -49,18 +52,32 @@ class CollectConfig(WritingConfig):
     style: str = "clear"
     # Fetch: the wall, and where the gripper, the goal and the block are placed.
     scene: SceneConfig = field(default_factory=SceneConfig)
-    # Fetch: width of a camera's pictures [pixels], which are recorded as a video; none by default.
-    picture_width: int | None = None
+    # state, or pixels_agent_pos: a camera's pictures are recorded as a video instead of what else the policy is told about
+    # goal and block. For the environment: --env.obs_type and --env.render_size.
+    obs_type: str = "state"
+    # Width of these pictures, for a maze their longer side [pixels].
+    picture_width: int = 128
     # Fetch: processes side by side.
     n_processes: int = 1
     # Seed of everything random.
     seed: int = 0
     # Whether to replace a dataset that is already there.
     overwrite: bool = False
+    # Whether to publish the dataset on the Hugging Face Hub under the name --repo_id. You must be logged in there.
+    push_to_hub: bool = False
+    # Whether a new repository on the Hub is private.
+    private: bool | None = None
 
 
 def main(config: CollectConfig) -> None:
     """Runs the command."""
+    with published_if_asked(config.repo_id, config.root, config.push_to_hub, config.private):
+        _collect(config)
+
+
+def _collect(config: CollectConfig) -> None:
+    if config.obs_type not in OBS_TYPES:
+        raise ValueError(f"obs_type must be one of {list(OBS_TYPES)}, got {config.obs_type!r}")
     from lerobot_pf2mp.dataset_tools.fetch_dataset import FETCH_OF_TASK
     from lerobot_pf2mp.dataset_tools.handwriting_dataset import SPACE_OF_TASK
     from lerobot_pf2mp.dataset_tools.maze_dataset import MAZE_OF_TASK
@@ -74,6 +91,10 @@ def main(config: CollectConfig) -> None:
     else:
         tasks = [*MAZE_OF_TASK, *FETCH_OF_TASK, *SPACE_OF_TASK]
         raise ValueError(f"task must be one of {tasks}, got {config.task!r}")
+
+
+def _picture_width(config: CollectConfig) -> int | None:
+    return None if config.obs_type == "state" else config.picture_width
 
 
 def _collect_maze(config: CollectConfig) -> None:
@@ -91,6 +112,7 @@ def _collect_maze(config: CollectConfig) -> None:
         n_episodes=4000 if config.n_episodes is None else config.n_episodes,
         n_steps=n_steps,
         action_noise=config.action_noise,
+        picture_width=_picture_width(config),
         seed=config.seed,
         overwrite=config.overwrite,
     )
@@ -109,7 +131,7 @@ def _collect_fetch(config: CollectConfig, task: str) -> None:
         n_episodes=1000 if config.n_episodes is None else config.n_episodes,
         n_steps=n_steps,
         style=config.style,
-        picture_width=config.picture_width,
+        picture_width=_picture_width(config),
         scene_changes=asdict(config.scene),
         seed=config.seed,
         n_processes=config.n_processes,
@@ -134,6 +156,7 @@ def _collect_handwriting(config: CollectConfig, space: str) -> None:
         n_episodes=default if config.n_episodes is None else config.n_episodes,
         n_steps=n_steps,
         scene_options=config.scene_options,
+        picture_width=_picture_width(config),
         seed=config.seed,
         overwrite=config.overwrite,
     )

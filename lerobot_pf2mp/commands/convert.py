@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_pf2mp.commands.command import dataset_place, report
+from lerobot_pf2mp.commands.publishing import published_if_asked
 from lerobot_pf2mp.commands.scene import SceneConfig
 from lerobot_pf2mp.commands.writing import WritingConfig
 from lerobot_pf2mp.envs.sheet import HANDWRITING_STEPS
@@ -73,10 +74,19 @@ class ConvertConfig(WritingConfig):
     scene: SceneConfig = field(default_factory=SceneConfig)
     # Whether to replace a dataset that is already there.
     overwrite: bool = False
+    # Whether to publish the dataset on the Hugging Face Hub under the name --repo_id. You must be logged in there.
+    push_to_hub: bool = False
+    # Whether a new repository on the Hub is private.
+    private: bool | None = None
 
 
 def main(config: ConvertConfig) -> None:
     """Runs the command."""
+    with published_if_asked(config.repo_id, config.root, config.push_to_hub, config.private):
+        _convert(config)
+
+
+def _convert(config: ConvertConfig) -> None:
     source = config.source
     if source.path is None:
         raise ValueError("--source.path must name the recording, got none")
@@ -152,6 +162,8 @@ def _convert_handwriting(config: ConvertConfig, path: Path) -> None:
     from lerobot_pf2mp.dataset_tools.convert_handwriting import convert_handwriting
     from lerobot_pf2mp.dataset_tools.handwriting_dataset import SPACE_OF_TASK
 
+    if config.maze_map is not None:
+        raise ValueError(f"--maze_map is for mazes only, got {config.maze_map}")
     if config.task not in SPACE_OF_TASK:
         raise ValueError(f"task must be one of {list(SPACE_OF_TASK)}, got {config.task!r}")
     repo_id, root = dataset_place(config.repo_id, config.root, config.task)

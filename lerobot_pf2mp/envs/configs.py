@@ -3,18 +3,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
+from gymnasium.wrappers import AddRenderObservation, FilterObservation
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import freeze_after_episode_end
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_STATE
 
 from lerobot_pf2mp.envs.box import Box
 from lerobot_pf2mp.envs.fetch_scene import FETCH_FPS, check_inner_steps, make_scene
+from lerobot_pf2mp.envs.picture_size import picture_size_of
 from lerobot_pf2mp.envs.sheet import (
     HANDWRITING_FPS,
     HANDWRITING_STEPS,
@@ -29,6 +32,7 @@ if TYPE_CHECKING:
 
 MAZE_TASKS = {"MazeUMaze-v0": "umaze", "MazeMedium-v0": "medium", "MazeLarge-v0": "large"}
 FETCH_TASKS = {"FetchReachWall-v0": "reach", "FetchPushWall-v0": "push"}
+OBS_TYPES = ("state", "pixels_agent_pos")
 HANDWRITING_TASKS = {"HandwritingJoint-v0": "joint", "HandwritingPen-v0": "pen"}
 
 
@@ -38,6 +42,7 @@ class _CollisionEnv(EnvConfig):
 
     Args:
         features_map: What LeRobot calls each feature; an environment need not have all of them.
+        obs_type: state, or pixels_agent_pos: rendered pictures instead of the environment's state, beside the robot's.
     """
 
     features_map: dict[str, str] = field(
@@ -45,8 +50,10 @@ class _CollisionEnv(EnvConfig):
             ACTION: ACTION,
             "agent_pos": OBS_STATE,
             "environment_state": OBS_ENV_STATE,
+            "pixels": OBS_IMAGE,
         }
     )
+    obs_type: str = "state"
 
     @property
     def package_name(self) -> str:
@@ -68,6 +75,8 @@ class _CollisionEnv(EnvConfig):
             disable_env_checker=self.disable_env_checker,
             **self.gym_kwargs,
         )
+        if self.obs_type == "pixels_agent_pos":
+            make_env = partial(_with_pixels, make_env)
         env_fns = [freeze_after_episode_end(make_env)] * n_envs
         env: gym.vector.VectorEnv
         autoreset_mode = gym.vector.AutoresetMode.NEXT_STEP
@@ -76,6 +85,36 @@ class _CollisionEnv(EnvConfig):
         else:
             env = gym.vector.SyncVectorEnv(env_fns, autoreset_mode=autoreset_mode)
         return {self.type: {0: env}}
+
+    def _describe(
+        self, action_dim: int, environment_dim: int, picture_size: Callable[[], tuple[int, int]]
+    ) -> None:
+        """Sets `features`.
+
+        Args:
+            action_dim: Of the action and, as actions are positions, of the robot's state.
+            environment_dim: Of the environment's state; 0 without one.
+            picture_size: Height and width of rendered pictures [pixels].
+
+        Raises:
+            ConfigError: If there is no such `obs_type`.
+        """
+        if self.obs_type not in OBS_TYPES:
+            raise ConfigError(f"obs_type must be one of {list(OBS_TYPES)}, got {self.obs_type!r}")
+        self.features = {
+            ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(action_dim,)),
+            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(action_dim,)),
+        }
+        if self.obs_type == "pixels_agent_pos":
+            pixels = PolicyFeature(type=FeatureType.VISUAL, shape=(*picture_size(), 3))
+            self.features["pixels"] = pixels
+        elif environment_dim:
+            shape = (environment_dim,)
+            self.features["environment_state"] = PolicyFeature(type=FeatureType.ENV, shape=shape)
+
+
+def _with_pixels(make_env: Callable[[], gym.Env]) -> gym.Env:
+    return FilterObservation(AddRenderObservation(make_env(), render_only=False), ["agent_pos", "pixels"])
 
 
 @EnvConfig.register_subclass("pf2mp_maze")
@@ -103,13 +142,6 @@ class PF2MPMazeEnv(_CollisionEnv):
     collision_radius: float = 0.1
     terminate_on_success: bool = False
     render_size: int = 480
-    features: dict[str, PolicyFeature] = field(
-        default_factory=lambda: {
-            ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(2,)),
-            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(2,)),
-            "environment_state": PolicyFeature(type=FeatureType.ENV, shape=(2,)),
-        }
-    )
 
     def __post_init__(self) -> None:
         """Validates the task.
@@ -119,6 +151,16 @@ class PF2MPMazeEnv(_CollisionEnv):
         """
         if self.task not in MAZE_TASKS:
             raise ConfigError(f"task must be one of {list(MAZE_TASKS)}, got {self.task!r}")
+        self._describe(2, 2, self._picture_size)
+
+    def _picture_size(self) -> tuple[int, int]:
+        # Imported here because LeRobot imports this file for every command.
+        from lerobot_pf2mp.envs.maze_picture import MazePicture
+        from lerobot_pf2mp.envs.point_maze import parse_maze_map
+
+        with reported_on_the_command_line():
+            maze_map = parse_maze_map(self.maze_map or MAZE_TASKS[str(self.task)])
+            return MazePicture(maze_map, self.render_size).size
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
@@ -179,13 +221,8 @@ class PF2MPFetchEnv(_CollisionEnv):
         with reported_on_the_command_line():
             check_inner_steps(self.n_inner_steps)
             scene = make_scene(FETCH_TASKS[self.task], **self._scene_changes)
+            self._describe(3, 6 if scene.has_block else 3, lambda: picture_size_of(self.render_size))
         self.fps = round(FETCH_FPS / self.n_inner_steps)
-        n_objects = 2 if scene.has_block else 1
-        self.features = {
-            ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(3,)),
-            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(3,)),
-            "environment_state": PolicyFeature(type=FeatureType.ENV, shape=(3 * n_objects,)),
-        }
 
     @property
     def wall(self) -> Box:
@@ -251,11 +288,8 @@ class PF2MPHandwritingEnv(_CollisionEnv):
             raise ConfigError(f"task must be one of {list(HANDWRITING_TASKS)}, got {self.task!r}")
         with reported_on_the_command_line():
             _ = self.scene
-        dim = 9 if HANDWRITING_TASKS[self.task] == "joint" else 2
-        self.features = {
-            ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(dim,)),
-            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(dim,)),
-        }
+            dim = 9 if HANDWRITING_TASKS[self.task] == "joint" else 2
+            self._describe(dim, 0, lambda: picture_size_of(self.render_size))
 
     @property
     def scene(self) -> WritingScene:

@@ -45,6 +45,11 @@ class MazePicture:
                     corners = [j * self._scale, i * self._scale, (j + 1) * self._scale, (i + 1) * self._scale]
                     draw.rectangle(corners, fill=WALL, outline=WALL_EDGE)
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width [pixels]."""
+        return self._size[1], self._size[0]
+
     def draw(
         self,
         ball: np.ndarray,

@@ -18,6 +18,7 @@ from lerobot_pf2mp.envs.regions import Disc, Region, region_of
 from lerobot_pf2mp.envs.sheet import LETTER_HEIGHT, N_REGIONS, REGION_GAP, SHEET_CENTRE, SHEET_SIDE
 from lerobot_pf2mp.envs.stroke import distances, evenly_spaced, line_of
 
+_LOW, _HIGH = np.array(SHEET_CENTRE) - SHEET_SIDE / 2, np.array(SHEET_CENTRE) + SHEET_SIDE / 2
 _SPACING = 0.001  # of the letter's points [m]
 _RADII = (0.006, 0.045)  # smallest and largest of a letter's regions [m]
 _GRID = 0.002  # of the places where a region may be put [m]
@@ -56,17 +57,22 @@ class WritingScene:
         return min((region.clearance(way) for region in self.regions), default=math.inf)
 
 
+def is_on_sheet(places: np.ndarray) -> bool:
+    """Whether all of ``(..., 2)`` places x, y [m] are on the sheet."""
+    return bool((places >= _LOW).all() and (places <= _HIGH).all())
+
+
 def check_on_sheet(places: np.ndarray, name: str) -> None:
     """Checks that the pen reaches all of ``(..., 2)`` places x, y [m].
 
     Raises:
         ValueError: If one is not finite or not on the sheet.
     """
-    low, high = np.array(SHEET_CENTRE) - SHEET_SIDE / 2, np.array(SHEET_CENTRE) + SHEET_SIDE / 2
     if places.ndim < 1 or places.shape[-1] != 2 or not np.isfinite(places).all():
         raise ValueError(f"{name} must be finite places x, y [m], got {places.tolist()}")
-    if (places < low).any() or (places > high).any():
-        outside = places.reshape(-1, 2)[((places < low) | (places > high)).any(axis=-1).reshape(-1)][0]
+    if not is_on_sheet(places):
+        low, high = _LOW, _HIGH
+        outside = next(place for place in places.reshape(-1, 2) if not is_on_sheet(place))
         raise ValueError(
             f"{name} must lie on the sheet, where the arm reaches with an upright pen, x in [{low[0]:g}, {high[0]:g}] "
             f"and y in [{low[1]:g}, {high[1]:g}] m of its base; got {np.round(outside, 4).tolist()}"
@@ -98,7 +104,7 @@ def make_writing_scene(
         FileNotFoundError: If there is no such file.
     """
     if scene_file is not None:
-        return read_writing_scene(Path(scene_file))
+        return read_writing_scene(Path(scene_file).expanduser())
     if not (math.isfinite(letter_height) and letter_height > 0):
         raise ValueError(f"letter_height must be above 0 m, got {letter_height}")
     if not (math.isfinite(region_gap) and region_gap > 0):
