@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The entry points of the commands, one file each in `commands`."""
+"""The entry points of the commands, one file each in `commands`.
+
+All but that of pf2mp-info, which is in `_info` because it has to run where this package cannot be imported.
+"""
 
 from lerobot_pf2mp.commands.command import run
 
@@ -44,6 +47,20 @@ def benchmark() -> None:
     from lerobot_pf2mp.commands.benchmark import BenchmarkConfig, main
 
     run(BenchmarkConfig, main)
+
+
+def push() -> None:
+    """The command pf2mp-push."""
+    from lerobot_pf2mp.commands.push import PushConfig, main
+
+    run(PushConfig, main)
+
+
+def policy_server() -> None:
+    """The command pf2mp-policy-server."""
+    from lerobot_pf2mp.commands.policy_server import PolicyServerConfig, main
+
+    run(PolicyServerConfig, main)
 
 
 def plot() -> None:

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from draccus.utils import ParsingError
+from huggingface_hub.errors import HfHubHTTPError
 
 
 class ConfigError(ParsingError):
@@ -44,4 +45,6 @@ def explained(what: str) -> Iterator[None]:
 
 
 def _said_by(error: Exception) -> str:
-    return str(error) or type(error).__name__
+    text = str(error) or type(error).__name__
+    # LeRobot says that a file is not on the Hub whatever the Hub has answered, also that nobody is logged in.
+    return f"{text}: {error.__cause__}" if isinstance(error.__cause__, HfHubHTTPError) else text

@@ -32,6 +32,9 @@ class PathSample:
     velocity: Tensor
 
 
+Steer = Callable[[Tensor, Tensor, Tensor], Tensor]
+
+
 class Guide(Protocol):
     """Bends one integration step."""
 
@@ -133,6 +136,7 @@ def integrate(
     *,
     integrator: str = "euler",
     guide: Guide | None = None,
+    steer: Steer | None = None,
 ) -> Tensor:
     """The solution x_1 of dx/dt = v(x, t) from x_0 at t = 0, in `num_steps` steps of dt = 1/num_steps (Eq. 9).
 
@@ -143,6 +147,8 @@ def integrate(
         num_steps: The number N >= 1 of steps.
         integrator: ``euler`` (first order) or ``midpoint`` (second order).
         guide: Bends every step; None leaves the flow as it is.
+        steer: Maps ``(B, ...)`` points, ``(B,)`` times and velocities to other velocities. The guide is told the end point
+            that the velocity predicts, not the steered one, which may overshoot it by far.
 
     Returns:
         ``(B, ...)`` end points.
@@ -161,8 +167,11 @@ def integrate(
         slope = velocity(x, t)
         if integrator == "midpoint":
             slope = velocity(x + 0.5 * dt * slope, t + 0.5 * dt)
+        x_1 = x + (1 - step * dt) * slope
+        if steer is not None:
+            slope = steer(x, t, slope)
         x_next = x + dt * slope
         if guide is not None:
-            x_next = guide(x, x_next, x + (1 - step * dt) * slope, dt)
+            x_next = guide(x, x_next, x_1, dt)
         x = x_next
     return x

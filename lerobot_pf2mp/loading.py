@@ -14,6 +14,10 @@ from lerobot.policies.factory import get_policy_class
 from lerobot.processor import PolicyAction, PolicyProcessorPipeline
 
 from lerobot_pf2mp.errors import explained
+from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
+from lerobot_pf2mp.policies.guided.modeling_guided import fitted_field
+from lerobot_pf2mp.potential_field import PotentialField
+from lerobot_pf2mp.potential_field_processor import PotentialFieldProcessorStep
 
 
 def load_policy(
@@ -37,18 +41,44 @@ def load_policy(
     Raises:
         FileNotFoundError: If the path is neither a folder nor the name of a repository.
         OSError: If the checkpoint cannot be read or reached.
-        ValueError: If there is no such field, or it cannot have that value.
+        ValueError: If there is no such option, it cannot have that value, a file is damaged, or guidance is on and there
+            is no potential field for it.
     """
     config = load_config(path, revision=revision, device=device, **overrides)
     path = str(config.pretrained_path)
-    policy = get_policy_class(config.type).from_pretrained(path, config=config, revision=revision)
-    preprocessor, postprocessor = make_pre_post_processors(
-        config,
-        pretrained_path=path,
-        pretrained_revision=revision,
-        preprocessor_overrides={"device_processor": {"device": config.device}},
-    )
+    where = f"the checkpoint {path}{f' at revision {revision}' if revision else ''}"
+    with explained(f"the weights of {where} cannot be loaded"):
+        policy = get_policy_class(config.type).from_pretrained(path, config=config, revision=revision)
+    with explained(f"the processors of {where} cannot be loaded"):
+        preprocessor, postprocessor = make_pre_post_processors(
+            config,
+            pretrained_path=path,
+            pretrained_revision=revision,
+            preprocessor_overrides={"device_processor": {"device": config.device}},
+        )
+        if isinstance(config, GuidedConfig) and config.guidance_scale > 0:
+            loaded_field(config, preprocessor)
     return policy, preprocessor, postprocessor
+
+
+def loaded_field(
+    config: Any, preprocessor: PolicyProcessorPipeline[dict[str, Any], dict[str, Any]]
+) -> PotentialField:
+    """The potential field of a guided policy's preprocessor.
+
+    Args:
+        config: The policy's configuration.
+        preprocessor: Its preprocessor.
+
+    Raises:
+        ValueError: If there is none, it is not fitted, or it covers other dimensions than the policy's.
+    """
+    for step in preprocessor.steps:
+        if isinstance(step, PotentialFieldProcessorStep):
+            return fitted_field(step.demonstrations, config)
+    raise ValueError(
+        "guidance needs the potential field, got a preprocessor without its step: it belongs to another policy"
+    )
 
 
 def load_config(

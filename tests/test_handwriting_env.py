@@ -353,7 +353,7 @@ def test_a_new_stroke_begins_after_a_lift_and_the_way_between_is_not_drawn() -> 
 
 def test_a_way_in_several_parts_leaves_the_same_ink_as_in_one() -> None:
     rng = np.random.default_rng(0)
-    tips = np.cumsum(rng.normal(0, 0.004, size=(200, 3)), axis=0) + (0.45, 0, 0)
+    tips = (*np.cumsum(rng.normal(0, 0.004, size=(200, 3)), axis=0), 0.45, 0, 0)
     tips[:, 2] = 0.02 + 0.02 * np.sin(np.arange(200) / 6)  # down every 38 places
     whole, parts = Ink(scene_with(BAR, DISC)), Ink(scene_with(BAR, DISC))
     clearance = whole.draw(tips)

@@ -13,11 +13,12 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
 from lerobot_pf2mp.flow_matching import Guide
+from lerobot_pf2mp.model_card import WithModelCard
 from lerobot_pf2mp.policies.dppf.configuration_dppf import DPPFConfig
 from lerobot_pf2mp.policies.guided.modeling_guided import PotentialFieldGuidance
 
 
-class DPPFPolicy(DiffusionPolicy):
+class DPPFPolicy(WithModelCard, DiffusionPolicy):
     """Differs from `DiffusionPolicy` by a guide in the denoising loop, and by showing the field what it learns from.
 
     The weights are those of `DiffusionPolicy`. With ``guidance_scale=0`` nothing of its code is changed.

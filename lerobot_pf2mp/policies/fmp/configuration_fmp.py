@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
+from lerobot.policies.rtc.configuration_rtc import RTCConfig
 
 from lerobot_pf2mp.errors import reported_on_the_command_line
 from lerobot_pf2mp.flow_matching import INTEGRATORS, TIME_SAMPLINGS
@@ -45,6 +46,7 @@ class FMPConfig(PreTrainedConfig):
         gradient_checkpointing: Whether training recomputes the U-Net's blocks to save memory.
         num_inference_steps: Integration steps N.
         integrator: How the flow is integrated: euler (the paper) or midpoint (two network calls a step).
+        rtc_config: Options of real-time chunking, which lerobot-rollout --inference.type=rtc sets; None is off.
         compile_model: Whether to torch.compile the U-Net.
         compile_mode: Mode for torch.compile.
         time_sampling: Training times: uniform (the paper) or beta (more weight on the noisy end).
@@ -95,6 +97,7 @@ class FMPConfig(PreTrainedConfig):
     # Inference.
     num_inference_steps: int = 5
     integrator: str = "euler"
+    rtc_config: RTCConfig | None = None
     compile_model: bool = False
     compile_mode: str = "default"
 

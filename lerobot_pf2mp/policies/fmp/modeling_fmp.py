@@ -9,19 +9,22 @@ from typing import Any, cast
 
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.policies.rtc.modeling_rtc import RTCProcessor
 from lerobot.policies.utils import populate_queues
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
 from lerobot_pf2mp.ema import averaged_copy
 from lerobot_pf2mp.flow_matching import Guide, flow_matching_loss, integrate, sample_time
+from lerobot_pf2mp.model_card import WithModelCard
 from lerobot_pf2mp.networks import VelocityNetwork
 from lerobot_pf2mp.policies.fmp.configuration_fmp import FMPConfig
+from lerobot_pf2mp.real_time_chunking import continuing
 
 ACTION_IS_PAD = f"{ACTION}_is_pad"
 
 
-class FMPPolicy(PreTrainedPolicy):
+class FMPPolicy(WithModelCard, PreTrainedPolicy):
     """Generates chunks of actions by integrating a learned velocity field from noise.
 
     Of a chunk of `horizon` actions, counted from the oldest of `n_obs_steps` observations, the `n_action_steps` from
@@ -57,6 +60,7 @@ class FMPPolicy(PreTrainedPolicy):
         if config.compile_model:
             for network in (self.network, self.inference_network):
                 network.unet.compile(mode=config.compile_mode)
+        self.init_rtc_processor()
         self.reset()
 
     @property
@@ -78,6 +82,16 @@ class FMPPolicy(PreTrainedPolicy):
         self._queues: dict[str, deque[Tensor]] = {ACTION: deque(maxlen=self.config.n_action_steps)}
         for key in self._observation_keys:
             self._queues[key] = deque(maxlen=self.config.n_obs_steps)
+
+    def supports_rtc(self) -> bool:
+        """Whether real-time chunking works: with one observation, as the chunk then begins with the current step."""
+        return self.config.n_obs_steps == 1
+
+    def init_rtc_processor(self) -> None:
+        """Takes over `rtc_config`; LeRobot calls this after it has set it."""
+        rtc_config = self.config.rtc_config
+        is_on = rtc_config is not None and rtc_config.enabled
+        self._rtc_processor = RTCProcessor(rtc_config) if is_on else None
 
     def forward(self, batch: dict[str, Any], reduction: str = "mean") -> tuple[Tensor, None]:
         """The flow matching loss of a batch (Algorithm 1), with the moving average of the weights in eval mode.
@@ -127,9 +141,15 @@ class FMPPolicy(PreTrainedPolicy):
         noise: Tensor | None = None,
         generator: torch.Generator | None = None,
         guide: Guide | None = None,
+        *,
+        inference_delay: int = 0,
+        prev_chunk_left_over: Tensor | None = None,
+        execution_horizon: int | None = None,
         **kwargs: Any,
     ) -> Tensor:
         """The next `n_action_steps` actions, ``(B, n_action_steps, action_dim)`` [normalised].
+
+        With real-time chunking all ``horizon`` of them, the first of which go on from the last chunk.
 
         Args:
             batch: Normalised observations as for `forward`. A single frame stands for the whole window if
@@ -137,8 +157,20 @@ class FMPPolicy(PreTrainedPolicy):
             noise: ``(B, horizon, action_dim)`` prior sample x_0; drawn from N(0, I) if None.
             generator: Source of randomness for that draw.
             guide: Bends every step, in place of the configured guidance; None for that.
+            inference_delay: Real-time chunking: steps that are executed before this chunk is there.
+            prev_chunk_left_over: Real-time chunking: ``([B,] T_left, action_dim)`` the last chunk's actions that have not
+                been executed [normalised]; None begins afresh.
+            execution_horizon: Real-time chunking: steps up to which this chunk is drawn to those; None for the
+                configuration's.
             **kwargs: Ignored, for callers that pass other policies' options.
+
+        Raises:
+            ValueError: If the noise has another shape, or there is a last chunk but real-time chunking is off.
         """
+        if prev_chunk_left_over is not None and self._rtc_processor is None:
+            raise ValueError(
+                "prev_chunk_left_over needs rtc_config, got none: call init_rtc_processor() after setting it"
+            )
         network = self.inference_network
         condition = network.encoder(self._observation_window(batch))
         shape = (condition.shape[0], self.config.horizon, self.config.action_feature.shape[0])
@@ -146,14 +178,21 @@ class FMPPolicy(PreTrainedPolicy):
             noise = torch.randn(shape, device=condition.device, generator=generator)
         elif tuple(noise.shape) != shape:
             raise ValueError(f"noise must have shape {shape}, got {tuple(noise.shape)}")
+
+        steer = None
+        if self._rtc_processor is not None and prev_chunk_left_over is not None:
+            steer = continuing(self._rtc_processor, prev_chunk_left_over, inference_delay, execution_horizon)
         chunk = integrate(
             lambda x_t, t: network(x_t, t, condition),
             noise.to(device=condition.device, dtype=torch.float32),
             self.config.num_inference_steps,
             integrator=self.config.integrator,
             guide=guide or self.make_guide(batch),
+            steer=steer,
         )  # (B, T, A)
         start = self.config.n_obs_steps - 1
+        if self._rtc_processor is not None:
+            return chunk[:, start:]
         return chunk[:, start : start + self.config.n_action_steps]
 
     @torch.no_grad()
@@ -171,7 +210,12 @@ class FMPPolicy(PreTrainedPolicy):
             noise: Prior sample for the next prediction, as for `predict_action_chunk`.
             generator: Source of randomness for the next prediction.
             **kwargs: Ignored, as in `predict_action_chunk`.
+
+        Raises:
+            RuntimeError: If real-time chunking is on, which asks for chunks.
         """
+        if self._rtc_processor is not None:
+            raise RuntimeError("with real-time chunking use predict_action_chunk instead of select_action")
         observation = {key: value for key, value in batch.items() if key != ACTION}
         if self.config.image_features:
             observation[OBS_IMAGES] = self._stack_cameras(batch)

@@ -12,13 +12,14 @@ from lerobot.utils.constants import ACTION
 
 from lerobot_pf2mp.flow_matching import Guide
 from lerobot_pf2mp.guidance import make_guide
+from lerobot_pf2mp.potential_field import PotentialField
 from lerobot_pf2mp.potential_field_processor import POTENTIAL_FIELD, DemonstratedActions
 
 if TYPE_CHECKING:
     from lerobot_pf2mp.policies.dppf.configuration_dppf import DPPFConfig
     from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
 
-    GuidedPolicyConfig = PF2MPConfig | DPPFConfig
+    type GuidedPolicyConfig = PF2MPConfig | DPPFConfig
 
 
 class PotentialFieldGuidance:
@@ -34,12 +35,14 @@ class PotentialFieldGuidance:
     ) -> None:
         self.config = config
         self._dataset_id = _identify_dataset(dataset_stats, config)
+        self.demonstrations: DemonstratedActions | None = None  # those of the last training batch
 
     def observe(self, batch: dict[str, Any]) -> None:
         """Shows a training batch's actions to the field that the preprocessor put into it; without one, does nothing."""
         demonstrations = batch.get(POTENTIAL_FIELD)
         if demonstrations is None:
             return
+        self.demonstrations = demonstrations
         frames = batch.get("index")
         demonstrations.observe(
             batch[ACTION],
@@ -62,23 +65,43 @@ class PotentialFieldGuidance:
         config = self.config
         if config.guidance_scale == 0:
             return None
-        demonstrations = batch.get(POTENTIAL_FIELD)
-        if not isinstance(demonstrations, DemonstratedActions):
-            raise ValueError(
-                f"guidance needs the potential field, which the policy's own preprocessor puts under {POTENTIAL_FIELD!r}; "
-                "got a batch without it. Load the preprocessor from the checkpoint, or set guidance_scale=0"
-            )
-        field = demonstrations.field(config.field_settings, device)
-        dims = config.field_action_dims
-        n_dims = config.action_feature.shape[0] if dims is None else len(dims)
-        if field.dim != n_dims:
-            raise ValueError(
-                f"the potential field must cover {n_dims} action dimensions, got a field over {field.dim}: it belongs to "
-                "another policy"
-            )
+        field = fitted_field(batch.get(POTENTIAL_FIELD), config, device)
         return make_guide(
-            field, config.guidance_scale, config.guidance_integrator, dims, config.guidance_point
+            field,
+            config.guidance_scale,
+            config.guidance_integrator,
+            config.field_action_dims,
+            config.guidance_point,
         )
+
+
+def fitted_field(
+    demonstrations: object, config: GuidedPolicyConfig, device: torch.device | str = "cpu"
+) -> PotentialField:
+    """The potential field that a policy is guided by.
+
+    Args:
+        demonstrations: What the policy's preprocessor puts into a batch.
+        config: The policy's configuration.
+        device: Where the field is used.
+
+    Raises:
+        ValueError: If there is no field, it is not fitted, or it covers other dimensions than the policy's.
+    """
+    if not isinstance(demonstrations, DemonstratedActions):
+        raise ValueError(
+            f"guidance needs the potential field, which the policy's own preprocessor puts under {POTENTIAL_FIELD!r}; "
+            "got a batch without it. Load the preprocessor from the checkpoint, or set guidance_scale=0"
+        )
+    field = demonstrations.field(config.field_settings, device)
+    dims = config.field_action_dims
+    n_dims = config.action_feature.shape[0] if dims is None else len(dims)
+    if field.dim != n_dims:
+        raise ValueError(
+            f"the potential field must cover {n_dims} action dimensions, got a field over {field.dim}: it belongs to "
+            "another policy"
+        )
+    return field
 
 
 def _identify_dataset(dataset_stats: dict[str, dict[str, Any]] | None, config: GuidedPolicyConfig) -> bytes:

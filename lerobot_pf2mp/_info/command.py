@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command pf2mp-info."""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import dataclass
+
+from .report import as_json, as_text, gather, is_well
+
+
+@dataclass
+class InfoConfig:
+    """Says what is installed, whether LeRobot finds this package, what works here, and what to do about the rest.
+
+    Each line ends in ok, optional (not here, and needed only for what the line says) or problem. Ends with code 0 if
+    there is no problem, else 1.
+
+    Examples:
+        pf2mp-info
+        pf2mp-info --json=true > info.json
+    """
+
+    # Whether to write JSON, for issue reports, instead of a table.
+    json: bool = False
+    # Longest that each trial may take [s].
+    time_limit: float = 120.0
+
+
+def main() -> None:
+    """The entry point."""
+    config = _parsed()
+    try:
+        lines = gather(config.time_limit)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    print((as_json if config.json else as_text)(lines))
+    sys.exit(0 if is_well(lines) else 1)
+
+
+def _parsed() -> InfoConfig:
+    try:
+        import draccus
+    except Exception:
+        # It comes with LeRobot. Without it there is all the more to report, with one of the options.
+        return InfoConfig(json="--json=true" in sys.argv[1:])
+    try:
+        config = draccus.parse(InfoConfig)
+        if not 0 < config.time_limit < math.inf:
+            raise draccus.ParsingError(
+                f"time_limit must be finite and above 0 [s], got {config.time_limit:g}"
+            )
+    except (draccus.utils.DecodingError, draccus.utils.ParsingError) as error:
+        print("error:", " ".join(str(error).split()), file=sys.stderr)
+        sys.exit(1)
+    return config

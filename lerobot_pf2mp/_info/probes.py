@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What can only be known by trying; each probe has a process of its own, for it may fail in any way.
+
+Usage: python probes.py NAME. Writes the answer as JSON, {"error": REASON} if there is none.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import json
+import logging
+import os
+import re
+import shutil
+import sys
+import warnings
+from importlib.metadata import distributions
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+DISTRIBUTION = "lerobot_policy_pf2mp"
+PACKAGE = "lerobot_pf2mp"
+
+_BALL = "<mujoco><worldbody><light pos='0 0 3'/><geom size='1'/></worldbody></mujoco>"
+_SIDE = 64  # of the pictures [pixels]
+_LONGEST = 300  # of what an error says [characters]
+
+
+def said_by(error: BaseException) -> str:
+    """Type and message of an error in one line of bounded length."""
+    words = " ".join(f"{type(error).__name__}: {error}".split())
+    return words if len(words) <= _LONGEST else words[: _LONGEST - 3] + "..."
+
+
+def discovery() -> dict[str, Any]:
+    """What LeRobot's commands find: our policies and environments; else what kept them from it."""
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    reasons = []
+
+    class Reasons(logging.Handler):
+        """Keeps the errors of our import, which LeRobot logs and goes on without us."""
+
+        def emit(self, record: logging.LogRecord) -> None:
+            """Called for each message."""
+            if record.exc_info and record.exc_info[1] and record.args == (DISTRIBUTION,):
+                reasons.append(said_by(record.exc_info[1]))
+
+    logging.getLogger().addHandler(Reasons())
+    register_third_party_plugins()
+
+    from lerobot.configs import PreTrainedConfig
+    from lerobot.envs.configs import EnvConfig
+
+    return {
+        "distributions": [name for name in map(_name_of, distributions()) if _is_ours(name)],
+        "reasons": reasons,
+        "policies": _ours(PreTrainedConfig.get_known_choices()),
+        "environments": _ours(EnvConfig.get_known_choices()),
+    }
+
+
+def device() -> dict[str, Any]:
+    """Where torch computes."""
+    import torch
+
+    answer: dict[str, Any] = {"cores": _n_cores(), "gpus": [], "said": "", "mps": False}
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        has_gpu = torch.cuda.is_available()
+    answer["said"] = " ".join(" ".join(str(warning.message).split()) for warning in said)
+    if has_gpu:
+        float(torch.ones(2, device="cuda").sum())
+        for number in range(torch.cuda.device_count()):
+            properties = torch.cuda.get_device_properties(number)
+            answer["gpus"].append([properties.name, properties.total_memory])
+    elif torch.backends.mps.is_available():
+        float(torch.ones(2, device="mps").sum())
+        answer["mps"] = True
+    elif torch.version.cuda is None and shutil.which("nvidia-smi"):
+        answer["said"] = f"torch {torch.__version__} is built without CUDA"
+    return answer
+
+
+def rendering() -> dict[str, Any]:
+    """How MuJoCo renders, found by rendering a picture in the way of our environments."""
+    with _headless().rendering():
+        import mujoco
+        from gymnasium.envs.mujoco.mujoco_rendering import OffScreenViewer
+
+        model = mujoco.MjModel.from_xml_string(_BALL)
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        viewer = OffScreenViewer(model, data, _SIDE, _SIDE)
+        picture = viewer.render("rgb_array")
+        if picture.min() == picture.max():
+            raise RuntimeError("the picture of a ball is empty")
+    return {"backend": viewer.backend}
+
+
+def video() -> dict[str, Any]:
+    """Which of the two encoders that LeRobot uses work: for films, and for datasets with pictures."""
+    import av
+    import numpy as np
+
+    answer: dict[str, Any] = {"av": av.__version__, "encoders": {}}
+    for encoder in ("libx264", "libsvtav1"):
+        try:
+            with av.open(io.BytesIO(), "w", format="mp4") as film:
+                stream: Any = film.add_stream(encoder, rate=10)
+                stream.width, stream.height, stream.pix_fmt = _SIDE, _SIDE, "yuv420p"
+                picture = av.VideoFrame.from_ndarray(np.zeros((_SIDE, _SIDE, 3), np.uint8), format="rgb24")
+                for packet in [*stream.encode(picture), *stream.encode()]:
+                    film.mux(packet)
+            answer["encoders"][encoder] = ""
+        except Exception as error:
+            answer["encoders"][encoder] = said_by(error)
+    return answer
+
+
+PROBES = {probe.__name__: probe for probe in (discovery, device, rendering, video)}
+
+
+def _ours(choices: dict[str, type]) -> list[str]:
+    return sorted(name for name, choice in choices.items() if choice.__module__.split(".")[0] == PACKAGE)
+
+
+def _name_of(distribution: Any) -> str:
+    return distribution.metadata.get("Name") or ""
+
+
+def _is_ours(name: str) -> bool:
+    return re.sub(r"[-_.]+", "_", name).lower() == DISTRIBUTION
+
+
+def _n_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _headless() -> ModuleType:
+    """`lerobot_pf2mp.envs.headless`, without importing the rest of the package, which may fail."""
+    package = importlib.util.find_spec(PACKAGE)
+    if package is None or not package.submodule_search_locations:
+        raise ImportError(f"no module named {PACKAGE}")
+    path = Path(package.submodule_search_locations[0]) / "envs" / "headless.py"
+    spec = importlib.util.spec_from_file_location("headless", path)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{path} cannot be imported")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def _main(name: str) -> None:
+    # Whatever a library prints must not end up in the answer.
+    with os.fdopen(os.dup(1), "w", encoding="utf-8") as output:
+        os.dup2(2, 1)
+        # This folder, which LeRobot's commands do not have in their path.
+        if not getattr(sys.flags, "safe_path", False):
+            del sys.path[0]
+        try:
+            answer = PROBES[name]()
+        except BaseException as error:
+            answer = {"error": said_by(error)}
+        json.dump(answer, output)
+
+
+if __name__ == "__main__":
+    _main(sys.argv[1])

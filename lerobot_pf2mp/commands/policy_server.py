@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command pf2mp-policy-server."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+POLICIES = ("fmp", "pf2mp", "dppf")
+
+
+@dataclass
+class PolicyServerConfig:
+    """Serves policies to robots elsewhere: LeRobot's asynchronous inference, whose own list of policies is closed.
+
+    Needs: pip install "lerobot_policy_pf2mp[async]". The robot runs LeRobot's own client:
+
+        python -m lerobot.async_inference.robot_client --server_address=127.0.0.1:8080 --policy_type=pf2mp \
+--pretrained_name_or_path=you/your_pf2mp --actions_per_chunk=16 --robot.type=so101_follower --robot.port=/dev/ttyACM0
+
+    Client and server exchange pickles, as LeRobot made it: whoever reaches the port can run code on this machine. Let it
+    listen on 127.0.0.1, the default, and use a tunnel to reach it from another one.
+
+    Examples:
+        pf2mp-policy-server
+        pf2mp-policy-server --port=9000 --fps=10 --inference_latency=0.1
+    """
+
+    # Address to listen on.
+    host: str = "127.0.0.1"
+    # Port to listen on.
+    port: int = 8080
+    # Control frequency of the robot [Hz].
+    fps: int = 30
+    # Least time between an observation and its actions [s].
+    inference_latency: float = 1 / 30
+    # How long to wait for an observation [s].
+    obs_queue_timeout: float = 2.0
+
+
+def main(config: PolicyServerConfig) -> None:
+    """Runs the command."""
+    if config.fps < 1:
+        raise ValueError(f"fps must be at least 1 Hz, got {config.fps}")
+    try:
+        from lerobot.async_inference import configs, constants, policy_server
+    except ImportError as error:
+        raise ImportError(
+            f'pf2mp-policy-server needs: pip install "lerobot_policy_pf2mp[async]" ({error})'
+        ) from error
+    server_config = configs.PolicyServerConfig(**asdict(config))
+    # The server checks against this very list.
+    constants.SUPPORTED_POLICIES.extend(
+        policy for policy in POLICIES if policy not in constants.SUPPORTED_POLICIES
+    )
+    policy_server.serve(server_config)

@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command pf2mp-push."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from lerobot_pf2mp.commands.command import given
+
+
+@dataclass
+class PushConfig:
+    """Publishes a checkpoint on the Hugging Face Hub, with a model card, in one commit.
+
+    The checkpoint is loaded first: one that is damaged, or a guided policy whose potential field is missing, is not
+    published. You must be logged in (hf auth login, or the variable HF_TOKEN).
+
+    Examples:
+        pf2mp-push --path=outputs/MazeLarge-v0/pf2mp_0/checkpoints/last/pretrained_model --repo_id=you/pf2mp_maze_large
+        pf2mp-push --path=outputs/dppf --repo_id=you/your_dppf --private=true --dataset=you/your_dataset \
+--results=outputs/comparison --figures='[trajectories.png, rollout.mp4]'
+    """
+
+    # The checkpoint's pretrained_model folder.
+    path: Path | None = None
+    # Where to publish it, user/name.
+    repo_id: str | None = None
+    # Whether a new repository is private.
+    private: bool | None = None
+    # Folder that pf2mp-benchmark has written, for a table of results; by default the checkpoint's own "results".
+    results: Path | None = None
+    # Pictures (png) and videos (mp4) for the card.
+    figures: list[Path] = field(default_factory=list)
+    # Name of the dataset on the Hub; by default the one that the policy was trained on.
+    dataset: str | None = None
+    # Branch to publish to, made if there is none; by default main.
+    branch: str | None = None
+
+
+def main(config: PushConfig) -> None:
+    """Runs the command."""
+    from lerobot_pf2mp.publish_checkpoint import publish_checkpoint
+
+    url = publish_checkpoint(
+        given("--path", config.path).expanduser(),
+        given("--repo_id", config.repo_id),
+        results=config.results and config.results.expanduser(),
+        figures=[figure.expanduser() for figure in config.figures],
+        dataset=config.dataset,
+        private=config.private,
+        branch=config.branch,
+    )
+    print(f"Published {config.path} at {url}.")

@@ -1,0 +1,296 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The model card of a policy: its README.md on the Hub, made from what is known about it."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import PurePosixPath
+from typing import TYPE_CHECKING, Any
+
+import draccus
+from huggingface_hub import ModelCard, ModelCardData
+
+from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
+
+if TYPE_CHECKING:
+    from lerobot.configs import PreTrainedConfig
+
+    from lerobot_pf2mp.potential_field import PotentialField
+
+INSTALL = "pip install lerobot_policy_pf2mp"
+
+_TAGS = {"fmp": ["flow-matching"], "pf2mp": ["flow-matching"], "dppf": ["diffusion"]}
+POLICY_NAMES = {
+    "fmp": "Flow Matching Policy (FMP)",
+    "pf2mp": "Potential Field-Guided Flow Matching Policy (PF2MP)",
+    "dppf": "Diffusion Policy with Potential Field Guidance (DPPF)",
+}
+_GENERATES = {
+    "fmp": "It turns noise into a chunk of actions by integrating a learned velocity field.",
+    "pf2mp": "It turns noise into a chunk of actions by integrating a learned velocity field.",
+    "dppf": "It is LeRobot's Diffusion Policy, whose denoising turns noise into a chunk of actions.",
+}
+_GUIDED = (
+    "On the way a potential field, fitted to the demonstrated actions alone, steers every action back to where the "
+    "demonstrations went, and so away from obstacles that nobody has modelled. The field is part of this repository and "
+    "comes with the preprocessor; `--policy.guidance_scale=0` turns it off. The method is *Towards Safe Imitation Learning "
+    "via Potential Field-Guided Flow Matching* (Ding et al., IROS 2025, [arXiv:2508.08707]"
+    "(https://arxiv.org/abs/2508.08707))."
+)
+_LIMITS = (
+    "Obstacles must be where they were in the demonstrations, and demonstrations must cover the free space that is needed: "
+    "what was never visited counts as unsafe.",
+    "The field sees single actions, not the way from one to the next.",
+    "It is guidance, not a guarantee: collisions become rare, not impossible. Do not rely on it where people could be hurt.",
+)
+_UNGUIDED_LIMITS = ("It imitates the demonstrations and knows nothing of obstacles or of limits of a robot.",)
+
+
+@dataclass(frozen=True)
+class CardFacts:
+    """What a card is made from.
+
+    Args:
+        config: The policy's configuration.
+        repo_id: Where it is published, ``user/name``.
+        dataset: Name of the dataset it was trained on; None if unknown.
+        dataset_size: Its number of episodes and of frames; None if unknown.
+        training: LeRobot's training configuration, as in ``train_config.json``; empty if unknown.
+        env_options: Options of lerobot-eval for the environment, as `env_options` gives them; empty if unknown.
+        potential_field: What guides it; None without one.
+        table: A table of results in Markdown; None without one.
+        made_with: Versions and hardware of the results.
+        figures: Pictures and videos, by their paths in the repository.
+        license: Name of the licence.
+        tags: Further tags.
+    """
+
+    config: PreTrainedConfig
+    repo_id: str
+    dataset: str | None = None
+    dataset_size: tuple[int, int] | None = None
+    training: Mapping[str, Any] = field(default_factory=dict)
+    env_options: Sequence[str] = ()
+    potential_field: PotentialField | None = None
+    table: str | None = None
+    made_with: Mapping[str, str] = field(default_factory=dict)
+    figures: Sequence[str] = ()
+    license: str = "apache-2.0"
+    tags: Sequence[str] = ()
+
+
+class WithModelCard:
+    """A policy that is published with a card of this package, to be mixed into LeRobot's policies before their own class.
+
+    LeRobot 0.6 asks the policy for its card. Should a later one not ask, its own card is published.
+    """
+
+    def generate_model_card(
+        self,
+        dataset_repo_id: str | None,
+        model_type: str,
+        license: str | None = None,
+        tags: Sequence[str] | None = None,
+        cfg: Any = None,
+        dataset_meta: Any = None,
+        **_: Any,
+    ) -> ModelCard:
+        """The card; the arguments are those of LeRobot's `PreTrainedPolicy.generate_model_card`."""
+        config: Any = self.config  # type: ignore[attr-defined]
+        training = {} if cfg is None else cfg.to_dict()
+        facts = CardFacts(
+            config=config,
+            repo_id=config.repo_id or f"you/your_{model_type}",
+            dataset=dataset_repo_id,
+            dataset_size=dataset_meta and (dataset_meta.total_episodes, dataset_meta.total_frames),
+            training=training,
+            env_options=env_options(training.get("env")),
+            potential_field=_field_of(self, config),
+            license=license or "apache-2.0",
+            tags=tuple(tags or ()),
+        )
+        return make_model_card(facts)
+
+
+def make_model_card(facts: CardFacts) -> ModelCard:
+    """The card of a policy of this package."""
+    kind = facts.config.type
+    tags = ["lerobot", "pf2mp", *_TAGS[kind], "robotics", kind, *facts.tags]
+    metadata = ModelCardData(
+        library_name="lerobot",
+        pipeline_tag="robotics",
+        license=facts.license,
+        tags=list(dict.fromkeys(tags)),
+        datasets=[str(facts.dataset)] if _is_on_the_hub(facts.dataset) else None,
+    )
+    is_guided = isinstance(facts.config, GuidedConfig)
+    sections = [
+        f"# {facts.repo_id}",
+        f"A {POLICY_NAMES[kind]} for [LeRobot](https://github.com/huggingface/lerobot). {_GENERATES[kind]}"
+        + (f" {_GUIDED}" if is_guided else ""),
+        "## Use",
+        _usage(facts),
+        "## Details",
+        _table(_details(facts)),
+        *_results(facts),
+        "## Limits",
+        "\n".join(f"- {limit}" for limit in (_LIMITS if is_guided else _UNGUIDED_LIMITS)),
+        "## Licence",
+        facts.license,
+    ]
+    return ModelCard(f"---\n{metadata.to_yaml()}\n---\n\n" + "\n\n".join(sections) + "\n")
+
+
+def env_options(env: Mapping[str, Any] | None) -> list[str]:
+    """The options by which lerobot-eval makes an environment: type, task and what differs from the defaults.
+
+    Args:
+        env: LeRobot's configuration of the environment as a dictionary; None if unknown.
+    """
+    from lerobot.envs.configs import EnvConfig
+
+    if env is None or env["type"] not in EnvConfig.get_known_choices():
+        return []
+    defaults = draccus.encode(EnvConfig.get_choice_class(env["type"])(), EnvConfig)
+    options = [f"--env.type={env['type']}"]
+    for name, value in env.items():
+        is_changed = (
+            name in defaults and value != defaults[name] and not name.startswith(("type", "features"))
+        )
+        if is_changed or name == "task":
+            text = value if isinstance(value, str) else json.dumps(value)
+            options.append(f"--env.{name}={shlex.quote(text)}")
+    return options
+
+
+def _field_of(policy: object, config: Any) -> PotentialField | None:
+    """The field of the actions that a policy was just trained on; None if it has none."""
+    demonstrations = getattr(getattr(policy, "_guidance", None), "demonstrations", None)
+    with suppress(ValueError):  # not fitted, as in a training of no steps
+        return demonstrations and demonstrations.field(config.field_settings)
+    return None
+
+
+def _is_on_the_hub(dataset: str | None) -> bool:
+    """Whether a dataset's name can be one of the Hub's; those of this package's commands are local/... by default."""
+    return bool(dataset and dataset.count("/") == 1 and not dataset.startswith("local/"))
+
+
+def _usage(facts: CardFacts) -> str:
+    dataset = facts.dataset if _is_on_the_hub(facts.dataset) else "you/your_dataset"
+    env = " ".join(facts.env_options or ("--env.type=ENVIRONMENT", "--env.task=TASK"))
+    kind = facts.config.type
+    commands = f"""\
+```bash
+{INSTALL}
+
+# evaluate it
+lerobot-eval --policy.path={facts.repo_id} {env} \\
+    --eval.n_episodes=50 --eval.batch_size=10
+
+# train one like it, or go on from this one
+lerobot-train --policy.type={kind} --dataset.repo_id={dataset} --policy.repo_id=you/your_{kind}
+lerobot-train --policy.path={facts.repo_id} --dataset.repo_id={dataset} --policy.repo_id=you/your_{kind}
+```
+
+In Python:
+
+```python
+from lerobot_pf2mp import load_policy
+policy, preprocess, postprocess = load_policy("{facts.repo_id}")
+action = postprocess(policy.select_action(preprocess(observation)))
+```"""
+    notes = [
+        "`load_policy(..., revision=...)` takes everything from one revision; `lerobot-eval` takes the processors from the "
+        "main branch whatever the revision, so download an older one first (`hf download "
+        f"{facts.repo_id} --revision REVISION --local-dir FOLDER`) and give it the folder."
+    ]
+    if any(option.startswith("--env.type=pf2mp_") for option in facts.env_options):
+        notes.append(
+            "In the output of `lerobot-eval`, `avg_sum_reward` is minus the collision rate and `pc_success` the success "
+            "rate [%]."
+        )
+    return "\n\n".join([commands, *notes])
+
+
+def _details(facts: CardFacts) -> list[tuple[str, str]]:
+    config: Any = facts.config
+    rows = [("dataset", _describe_dataset(facts))]
+    for name, features in (("inputs", config.input_features), ("outputs", config.output_features)):
+        if features:
+            rows.append((name, ", ".join(f"`{key}` {tuple(ft.shape)}" for key, ft in features.items())))
+    rows.append(("chunk", f"{config.horizon} actions, of which {config.n_action_steps} are executed"))
+    rows.append(("steps N", str(config.num_inference_steps or config.num_train_timesteps)))
+    if isinstance(config, GuidedConfig):
+        point = f", field asked at: {config.guidance_point}" if config.guidance_point else ""
+        rows.append(("guidance strength lambda", f"{config.guidance_scale:g}"))
+        rows.append(("guidance integrator", f"{config.guidance_integrator}{point}"))
+    if facts.potential_field is not None:
+        rows += _describe_field(facts.potential_field, config)
+    words = {"steps": "steps: {}", "batch_size": "batch size: {}", "seed": "seed: {}"}
+    known = {key: facts.training.get(key) for key in words}
+    if any(value is not None for value in known.values()):
+        described = [words[key].format(value) for key, value in known.items() if value is not None]
+        rows.append(("training", ", ".join(described)))
+    versions = [f"{name} {version(name)}" for name in ("lerobot", "lerobot_policy_pf2mp")]
+    rows.append(("versions", ", ".join(versions)))
+    return rows
+
+
+def _describe_dataset(facts: CardFacts) -> str:
+    if facts.dataset is None:
+        return "unknown"
+    name = f"`{facts.dataset}`, not published"
+    if _is_on_the_hub(facts.dataset):
+        name = f"[{facts.dataset}](https://huggingface.co/datasets/{facts.dataset})"
+    if facts.dataset_size is None:
+        return name
+    n_episodes, n_frames = facts.dataset_size
+    return f"{name}: {n_episodes} episodes, {n_frames} frames"
+
+
+def _describe_field(potential_field: PotentialField, config: GuidedConfig) -> list[tuple[str, str]]:
+    dims = config.field_action_dims
+    covered = f"all {potential_field.dim}" if dims is None else ", ".join(map(str, dims))
+    rule = f", by the rule {config.field_bandwidth}" if isinstance(config.field_bandwidth, str) else ""
+    return [
+        ("bandwidth h", f"{potential_field.bandwidth:.4g} [normalised action units]{rule}"),
+        ("anchors M", f"{len(potential_field.anchors)} demonstrated actions"),
+        ("action dimensions of the field", covered),
+        ("distance term alpha", f"{config.field_alpha:g}"),
+    ]
+
+
+def _results(facts: CardFacts) -> list[str]:
+    if facts.table is None and not facts.figures:
+        return []
+    sections = ["## Results"]
+    if facts.table is not None:
+        sections.append(facts.table.strip())
+        sections.append(
+            "Rates are means over all episodes with their standard deviation over repeats, the interval is Wilson's, p is "
+            "McNemar's exact test against the same weights, starts, goals and noise without guidance. Made by "
+            "`pf2mp-benchmark`; all numbers are in [results/summary.csv](results/summary.csv), settings in "
+            "[results/run.json](results/run.json)."
+        )
+    if facts.made_with:
+        made_with = ", ".join(f"{name} {value}" for name, value in facts.made_with.items())
+        sections.append(f"Measured with {made_with}.")
+    return [*sections, *(_show(figure, facts.repo_id) for figure in facts.figures)]
+
+
+def _show(figure: str, repo_id: str) -> str:
+    """A picture, or a video, for which the Hub wants a full address."""
+    path = PurePosixPath(figure)
+    if path.suffix == ".mp4":
+        return f'<video controls src="https://huggingface.co/{repo_id}/resolve/main/{figure}"></video>'
+    return f"![{path.stem.replace('_', ' ')}]({figure})"
+
+
+def _table(rows: Sequence[tuple[str, str]]) -> str:
+    return "\n".join(["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)])

@@ -1,0 +1,348 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The report of pf2mp-info, in this environment and in new ones in which something is wrong."""
+
+import json
+import os
+import subprocess
+import sys
+import sysconfig
+import venv
+from collections.abc import Callable
+from importlib.metadata import distribution, version
+from pathlib import Path
+
+import pytest
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.envs.configs import EnvConfig
+
+import lerobot_pf2mp
+
+ROOT = Path(__file__).parents[1]
+BIN = Path(sys.executable).parent
+SECONDS = 400
+PACKAGES = (
+    "lerobot_policy_pf2mp",
+    "lerobot",
+    "torch",
+    "mujoco",
+    "gymnasium",
+    "gymnasium-robotics",
+    "numpy",
+    "mink",
+    "shapely",
+    "minari",
+    "accelerate",
+)
+ESSENTIAL = ("python", *PACKAGES, "discovery", "device")
+OTHERS = ("lerobot-train", "rendering", "video", "experts", "async (grpc)", "peft", "wandb")
+# Trials that do not answer in time are as good as none, where only the rest matters.
+WITHOUT_TRIALS = "--time_limit=0.001"
+
+
+def run(*command: str | Path, **changes: str) -> subprocess.CompletedProcess[str]:
+    environment = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "MUJOCO_GL")}
+    return subprocess.run(
+        command,
+        capture_output=True,
+        text=True,
+        timeout=SECONDS,
+        check=False,
+        cwd="/",
+        env={**environment, **changes},
+    )
+
+
+def lines_of(result: subprocess.CompletedProcess[str]) -> dict[str, dict[str, str]]:
+    """The lines of a report in JSON, by name; the code of the command fits them."""
+    report = json.loads(result.stdout)
+    assert sorted(report) == ["lines", "ok"]
+    assert report["ok"] == all(line["status"] != "problem" for line in report["lines"])
+    assert result.returncode == (0 if report["ok"] else 1)
+    assert result.stderr == ""
+    assert all(sorted(line) == ["name", "remedy", "status", "value"] for line in report["lines"])
+    assert all(line["remedy"] for line in report["lines"] if line["status"] != "ok")
+    lines = {line["name"]: line for line in report["lines"]}
+    assert len(lines) == len(report["lines"])
+    return lines
+
+
+@pytest.fixture
+def site_packages(tmp_path: Path) -> Path:
+    """Of a new environment with this one's dependencies, and with this package where a wheel would put it."""
+    venv.create(tmp_path / "env", with_pip=False)
+    (folder,) = (tmp_path / "env").glob("lib/python*/site-packages")
+    for entry in Path(sysconfig.get_paths()["purelib"]).iterdir():
+        if "pf2mp" not in entry.name and entry.suffix != ".pth":
+            (folder / entry.name).symlink_to(entry)
+    package = Path(lerobot_pf2mp.__file__).parent
+    (folder / "lerobot_pf2mp").symlink_to(package)
+    (folder / "lerobot_policy_pf2mp").symlink_to(package / "_autodiscover")
+    (folder / "pf2mp_info").symlink_to(package / "_info")
+    write_metadata(folder)
+    # Another plug-in that talks and fails, which is not our concern.
+    write_distribution(folder, "lerobot_policy_other", "1.0")
+    (folder / "lerobot_policy_other.py").write_text("print('hello')\nimport no_such_module")
+    return folder
+
+
+def write_distribution(site_packages: Path, name: str, version: str, text: str | None = None) -> None:
+    folder = site_packages / f"{name}-{version}.dist-info"
+    folder.mkdir()
+    text = text or f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n"
+    (folder / "METADATA").write_text(text)
+
+
+def write_metadata(site_packages: Path, *changes: tuple[str, str]) -> None:
+    installed = distribution("lerobot_policy_pf2mp")
+    text = installed.read_text("METADATA") or installed.read_text("PKG-INFO")  # the latter of a source tree
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    folder = site_packages / "lerobot_policy_pf2mp-0.1.0.dist-info"
+    folder.mkdir(exist_ok=True)
+    (folder / "METADATA").write_text(text)
+
+
+def remove(site_packages: Path, *names: str) -> None:
+    """Removes packages and what is known about them."""
+    for entry in site_packages.iterdir():
+        if entry.name.split("-")[0] in names and entry.is_symlink():
+            entry.unlink()
+
+
+def info(site_packages: Path, *options: str, **changes: str) -> subprocess.CompletedProcess[str]:
+    python = site_packages.parents[2] / "bin" / "python"
+    return run(python, "-c", "from pf2mp_info.command import main; main()", *options, **changes)
+
+
+@pytest.mark.slow
+def test_here_everything_essential_is_well() -> None:
+    lines = lines_of(run(BIN / "pf2mp-info", "--json=true"))
+    assert sorted(lines) == sorted([*ESSENTIAL, *OTHERS])
+    assert {name: lines[name]["status"] for name in ESSENTIAL} == dict.fromkeys(ESSENTIAL, "ok")
+    assert lines["python"]["value"].startswith(".".join(map(str, sys.version_info[:3])))
+    assert {name: lines[name]["value"] for name in PACKAGES} == {name: version(name) for name in PACKAGES}
+    policies, environments = (
+        [name for name, kind in choices.items() if kind.__module__.startswith("lerobot_pf2mp.")]
+        for choices in (PreTrainedConfig.get_known_choices(), EnvConfig.get_known_choices())
+    )
+    assert lines["discovery"]["value"] == (
+        f"policies {', '.join(sorted(policies))}; environments {', '.join(sorted(environments))}"
+    )
+    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else ""
+    assert gpu in lines["device"]["value"]
+    assert lines["experts"]["value"] == f"stable-baselines3 {version('stable-baselines3')}"
+    assert lines["rendering"]["value"] in ("EGL", "OSMesa", "screen")
+    assert lines["video"]["value"] == f"av {version('av')}: libx264, libsvtav1"
+
+
+@pytest.mark.slow
+def test_without_a_screen_glfw_does_not_render_which_is_said_and_is_not_essential() -> None:
+    result = run(BIN / "pf2mp-info", MUJOCO_GL="glfw")
+    assert result.returncode == 0, result.stdout
+    *rows, verdict = result.stdout.splitlines()
+    assert verdict == "No problem found."
+    assert [row.split("  ")[0] for row in rows if "  ok" not in row and "  optional: " not in row] == []
+    (rendering,) = (row for row in rows if row.startswith("rendering"))
+    assert "no pictures of Fetch and handwriting" in rendering
+    assert "optional: try without MUJOCO_GL: RuntimeError: rendering without a screen needs EGL" in rendering
+
+
+def break_nothing(site_packages: Path) -> None:
+    pass
+
+
+def break_by_not_installing(site_packages: Path) -> None:
+    (site_packages / "lerobot_policy_pf2mp-0.1.0.dist-info" / "METADATA").unlink()
+    (site_packages / "lerobot_policy_pf2mp-0.1.0.dist-info").rmdir()
+
+
+def break_by_hyphens(site_packages: Path) -> None:
+    write_metadata(site_packages, ("Name: lerobot_policy_pf2mp", "Name: lerobot-policy-pf2mp"))
+
+
+def break_by_a_missing_module(site_packages: Path) -> None:
+    (site_packages / "lerobot_policy_pf2mp").unlink()
+
+
+def replace_package(site_packages: Path, content: str) -> None:
+    (site_packages / "lerobot_pf2mp").unlink()
+    (site_packages / "lerobot_pf2mp").mkdir()
+    (site_packages / "lerobot_pf2mp" / "__init__.py").write_text(content)
+
+
+def break_by_an_import_error(site_packages: Path) -> None:
+    replace_package(site_packages, "from lerobot.configs import NoSuchName")
+
+
+def break_by_a_crash(site_packages: Path) -> None:
+    replace_package(site_packages, "import os\nos.abort()")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("break_it", "reason"),
+    [
+        (break_nothing, ""),
+        (
+            break_by_not_installing,
+            "no distribution lerobot_policy_pf2mp in {env}: pip install . in its folder",
+        ),
+        (
+            break_by_hyphens,
+            "the distribution is called lerobot-policy-pf2mp, LeRobot looks for lerobot_policy_pf2mp, with underscores: ",
+        ),
+        (
+            break_by_a_missing_module,
+            "ModuleNotFoundError: No module named 'lerobot_policy_pf2mp': pip install --force-reinstall",
+        ),
+        (
+            break_by_an_import_error,
+            "ImportError: cannot import name 'NoSuchName' from 'lerobot.configs' (",
+        ),
+        (
+            break_by_a_crash,
+            "LeRobot's discovery does not run: ended with code -6, having said: Fatal Python error: Aborted",
+        ),
+    ],
+    ids=["found", "not installed", "hyphens", "missing module", "import error", "crash"],
+)
+def test_if_lerobot_does_not_find_the_package_the_report_says_why(
+    site_packages: Path, break_it: Callable[[Path], None], reason: str
+) -> None:
+    break_it(site_packages)
+    lines = lines_of(info(site_packages, "--json=true"))
+    assert lines["discovery"]["remedy"].startswith(reason.format(env=site_packages.parents[2]))
+    assert lines["discovery"]["status"] == ("problem" if reason else "ok")
+    wrong = {"discovery"} if reason else set()
+    if break_it is break_by_not_installing:
+        wrong |= {"lerobot_policy_pf2mp"}
+    assert "no_such_module" not in lines["discovery"]["remedy"]
+    assert {name for name, line in lines.items() if line["status"] == "problem"} == wrong
+
+
+@pytest.mark.slow
+def test_without_lerobot_torch_and_draccus_the_report_is_complete_nevertheless(site_packages: Path) -> None:
+    remove(site_packages, "lerobot", "torch", "draccus", "packaging", "av", "stable_baselines3")
+    lines = lines_of(info(site_packages, "--json=true"))
+    assert sorted(lines) == sorted([*ESSENTIAL, *OTHERS, "version ranges"])
+    problems = {name: line["remedy"] for name, line in lines.items() if line["status"] == "problem"}
+    assert problems == {
+        "version ranges": "ModuleNotFoundError: No module named 'packaging'",
+        "lerobot": 'pip install "lerobot"',
+        "torch": 'pip install "torch"',
+        "discovery": "LeRobot's discovery does not run: ModuleNotFoundError: No module named 'lerobot'",
+        "device": "ModuleNotFoundError: No module named 'torch': install a torch that runs here "
+        "(pytorch.org/get-started/locally)",
+    }
+    assert lines["video"]["status"] == "optional"
+    assert lines["video"]["remedy"].startswith("ModuleNotFoundError: No module named 'av': pip install ")
+    assert lines["experts"] == {
+        "name": "experts",
+        "value": "no stable-baselines3",
+        "status": "optional",
+        "remedy": 'pip install "lerobot_policy_pf2mp[experts]"',
+    }
+    assert lines["numpy"]["status"] == "ok"
+
+
+@pytest.mark.slow
+def test_versions_outside_of_what_is_asked_for_are_problems(site_packages: Path) -> None:
+    write_metadata(site_packages, ("Requires-Python: >=3.12", "Requires-Python: >=3.99"))
+    lerobot = distribution("lerobot").read_text("METADATA").replace("Version: 0.6.1", "Version: 0.7.0")
+    remove(site_packages, "mujoco", "lerobot", "accelerate", "numpy", "mink", "shapely", "stable_baselines3")
+    write_distribution(site_packages, "lerobot", "0.7.0", lerobot)
+    write_distribution(site_packages, "mujoco", "3.12.0")
+    write_distribution(site_packages, "numpy", "2.3.0")
+    write_distribution(site_packages, "accelerate", "1.13.9")
+    write_distribution(site_packages, "shapely", "3.0.dev1")
+    write_distribution(site_packages, "stable_baselines3", "3.0.0")
+    lines = lines_of(info(site_packages, "--json=true", WITHOUT_TRIALS))
+    found = {
+        name: (line["value"], line["remedy"]) for name, line in lines.items() if line["status"] == "problem"
+    }
+    assert found.pop("python")[1] == "must be >=3.12,>=3.99: install into an environment of such a Python"
+    assert found.pop("discovery")[1].endswith("no answer within 0.001 s (--time_limit)")
+    assert found.pop("device")[1].startswith("no answer within 0.001 s (--time_limit)")
+    assert found == {
+        "mujoco": ("3.12.0", 'pip install "mujoco<3.12,>=3.3"'),
+        "lerobot": ("0.7.0", 'pip install "lerobot<0.7,>=0.6.1"'),
+        "numpy": ("2.3.0", 'pip install "numpy<2.3.0,>=2.0.0"'),  # LeRobot asks for it
+        "accelerate": (
+            "1.13.9",
+            'pip install "accelerate<2.0.0,>=1.14.0"',
+        ),  # and with an extra of an extra for this
+        "mink": ("not installed", 'pip install "mink>=1.1"'),
+    }
+    assert (lines["experts"]["value"], lines["experts"]["status"]) == ("stable-baselines3 3.0.0", "optional")
+
+
+@pytest.mark.slow
+def test_unreadable_metadata_cost_one_line_each(site_packages: Path) -> None:
+    remove(site_packages, "mink")
+    write_distribution(site_packages, "mink", "newest")
+    lines = lines_of(info(site_packages, "--json=true", WITHOUT_TRIALS))
+    assert sorted(lines) == sorted([*ESSENTIAL, *OTHERS])
+    assert (lines["mink"]["value"], lines["mink"]["status"]) == ("not known", "problem")
+    assert lines["mujoco"] == {"name": "mujoco", "value": version("mujoco"), "status": "ok", "remedy": ""}
+
+    write_metadata(site_packages, ("Requires-Dist: mink>=1.1", "Requires-Dist: mink of some age"))
+    lines = lines_of(info(site_packages, "--json=true", WITHOUT_TRIALS))
+    assert sorted(lines) == sorted([*ESSENTIAL, *OTHERS, "version ranges"])
+    assert (lines["version ranges"]["value"], lines["version ranges"]["status"]) == ("not checked", "problem")
+    assert lines["version ranges"]["remedy"].startswith("InvalidRequirement: ")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("content", "value", "status"),
+    [
+        ("#!{env}/bin/python\n", "of this environment", "ok"),
+        ("#!/elsewhere/bin/python3.12\n", "the one in PATH runs /elsewhere/bin/python3.12", "optional"),
+        ("#!/usr/bin/env bash\n", "of this environment", "ok"),
+        (None, "not in PATH", "optional"),
+    ],
+)
+def test_a_lerobot_train_of_another_environment_is_noticed(
+    tmp_path: Path, site_packages: Path, content: str | None, value: str, status: str
+) -> None:
+    env = site_packages.parents[2]
+    (tmp_path / "path").mkdir()
+    if content is not None:
+        (tmp_path / "path" / "lerobot-train").write_text(content.format(env=env))
+        (tmp_path / "path" / "lerobot-train").chmod(0o755)
+    line = lines_of(info(site_packages, "--json=true", WITHOUT_TRIALS, PATH=str(tmp_path / "path")))[
+        "lerobot-train"
+    ]
+    assert (line["value"], line["status"]) == (value, status)
+    assert (f"{env}/bin/lerobot-train" in line["remedy"]) == (status == "optional")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("--json=perhaps", "error: `json`: Couldn't parse 'perhaps' into a bool"),
+        ("--time_limit=0", "error: time_limit must be finite and above 0 [s], got 0"),
+        ("--time_limit=nan", "error: time_limit must be finite and above 0 [s], got nan"),
+        ("--time_limit=inf", "error: time_limit must be finite and above 0 [s], got inf"),
+    ],
+)
+def test_bad_values_end_in_one_line(option: str, message: str) -> None:
+    result = run(BIN / "pf2mp-info", option)
+    assert (result.returncode, result.stdout, result.stderr.strip()) == (1, "", message)
+
+
+@pytest.mark.slow
+def test_help_of_info_shows_examples_units_and_defaults() -> None:
+    result = run(BIN / "pf2mp-info", "--help")
+    assert (result.returncode, result.stderr) == (0, "")
+    words = " ".join(result.stdout.split())
+    for fact in (
+        "Examples: pf2mp-info",
+        "may take [s]. (default: 120.0)",
+        "for issue reports",
+        "Ends with code 0",
+    ):
+        assert fact in words

@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Policies on a robot, through LeRobot's own commands."""
+
+import json
+import os
+import re
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot.datasets import LeRobotDataset
+from lerobot_pf2mp.dataset_tools.collect_handwriting import collect_handwriting
+
+from lerobot_pf2mp import cli
+
+pytestmark = pytest.mark.slow
+
+BIN = Path(sys.executable).parent
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}  # where simulated_panda is
+ROBOT = ["--robot.type=simulated_panda", "--robot.discover_packages_path=simulated_panda"]
+
+
+@pytest.fixture(scope="module")
+def demonstrated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
+    """A hardly trained policy, and the postures (N, 9) that were demonstrated."""
+    folder = tmp_path_factory.mktemp("robot")
+    collect_handwriting(
+        "joint",
+        root=folder / "data",
+        repo_id="local/data",
+        n_episodes=3,
+        n_steps=64,
+        scene_options={},
+        seed=0,
+        overwrite=False,
+    )
+    run_well(
+        "lerobot-train",
+        "--policy.type=pf2mp",
+        "--policy.device=cpu",
+        "--policy.push_to_hub=false",
+        "--policy.horizon=16",
+        "--policy.n_action_steps=8",
+        "--policy.down_dims=[8,16]",
+        "--policy.guidance_scale=0.5",
+        "--policy.field_action_dims=[0,1,2,3,4,5,6]",
+        "--dataset.repo_id=local/data",
+        f"--dataset.root={folder / 'data'}",
+        f"--output_dir={folder / 'out'}",
+        "--batch_size=32",
+        "--num_workers=0",
+        "--steps=12",
+    )
+    actions = LeRobotDataset("local/data", root=folder / "data").hf_dataset.with_format("numpy")["action"][:]
+    return folder / "out/checkpoints/last/pretrained_model", np.asarray(actions)
+
+
+def run_well(command: str, *options: str) -> str:
+    finished = subprocess.run(
+        [str(BIN / command), *options],
+        capture_output=True,
+        text=True,
+        timeout=400,
+        check=False,
+        env=ENVIRONMENT,
+    )
+    assert finished.returncode == 0, finished.stdout[-2000:] + finished.stderr[-6000:]
+    return finished.stdout + finished.stderr
+
+
+def distance_from_demonstrations(log: Path, demonstrated: np.ndarray) -> float:
+    """Mean distance of the arm's targets in a log to the nearest demonstrated posture [rad]."""
+    targets = np.array([json.loads(line) for line in log.read_text().splitlines()])[:, :7]
+    assert len(targets) >= 8 and np.isfinite(targets).all()
+    gaps = np.linalg.norm(targets[:, None] - demonstrated[None, :, :7], axis=-1)
+    return float(gaps.min(axis=1).mean())
+
+
+def test_a_rollout_moves_the_arm_and_guidance_keeps_it_near_the_demonstrations(
+    demonstrated: tuple[Path, np.ndarray], tmp_path: Path
+) -> None:
+    checkpoint, postures = demonstrated
+    distances = {}
+    for scale in (0.5, 0.0):
+        log = tmp_path / f"{scale}.jsonl"
+        run_well(
+            "lerobot-rollout",
+            f"--policy.path={checkpoint}",
+            f"--policy.guidance_scale={scale}",
+            "--device=cpu",
+            *ROBOT,
+            f"--robot.log={log}",
+            "--fps=10",
+            "--duration=4",
+            "--play_sounds=false",
+            "--return_to_initial_position=false",
+        )
+        distances[scale] = distance_from_demonstrations(log, postures)
+    assert distances[0.5] < 0.2 * distances[0.0]
+
+
+def test_a_rollout_with_real_time_chunking_moves_the_arm_near_the_demonstrations(
+    demonstrated: tuple[Path, np.ndarray], tmp_path: Path
+) -> None:
+    checkpoint, postures = demonstrated
+    log = tmp_path / "chunks.jsonl"
+    run_well(
+        "lerobot-rollout",
+        f"--policy.path={checkpoint}",
+        "--device=cpu",
+        "--inference.type=rtc",
+        "--inference.rtc.execution_horizon=6",
+        *ROBOT,
+        f"--robot.log={log}",
+        "--fps=10",
+        "--duration=5",
+        "--play_sounds=false",
+        "--return_to_initial_position=false",
+    )
+    assert distance_from_demonstrations(log, postures) < 0.05
+
+
+@contextmanager
+def policy_server(folder: Path) -> Iterator[str]:
+    """The address of a pf2mp-policy-server that runs in a folder, where LeRobot writes its log."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    server = subprocess.Popen(
+        [str(BIN / "pf2mp-policy-server"), f"--port={port}", "--fps=10"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        cwd=folder,
+    )
+    try:
+        deadline = time.monotonic() + 120
+        while time.monotonic() < deadline and server.poll() is None:
+            with socket.socket() as client:
+                if client.connect_ex(("127.0.0.1", port)) == 0:
+                    break
+            time.sleep(0.2)
+        assert server.poll() is None, server.stdout.read()
+        yield f"127.0.0.1:{port}"
+    finally:
+        server.terminate()
+        server.communicate(timeout=30)
+
+
+CLIENT = """
+import sys, threading, time
+import simulated_panda
+from lerobot.async_inference.configs import RobotClientConfig
+from lerobot.async_inference.robot_client import RobotClient
+
+address, checkpoint, log = sys.argv[1:]
+client = RobotClient(RobotClientConfig(
+    policy_type="pf2mp", pretrained_name_or_path=checkpoint, actions_per_chunk=8, server_address=address, fps=10,
+    robot=simulated_panda.SimulatedPandaConfig(log=log)))
+assert client.start()
+receiver = threading.Thread(target=client.receive_actions, daemon=True)
+receiver.start()
+threading.Timer(12.0, client.shutdown_event.set).start()
+client.control_loop(task="")
+client.stop()
+"""
+
+
+def test_the_server_answers_lerobots_own_client(
+    demonstrated: tuple[Path, np.ndarray], tmp_path: Path
+) -> None:
+    checkpoint, postures = demonstrated
+    log = tmp_path / "served.jsonl"
+    with policy_server(tmp_path) as address:
+        finished = subprocess.run(
+            [sys.executable, "-c", CLIENT, address, str(checkpoint), str(log)],
+            capture_output=True,
+            text=True,
+            timeout=200,
+            check=False,
+            env=ENVIRONMENT,
+            cwd=tmp_path,
+        )
+    assert finished.returncode == 0, finished.stderr[-4000:]
+    assert distance_from_demonstrations(log, postures) < 0.05
+
+
+def test_the_server_says_what_is_missing(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    monkeypatch.setitem(sys.modules, "grpc", None)
+    for name in list(sys.modules):
+        if name.startswith("lerobot.async_inference"):
+            monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr(sys, "argv", ["pf2mp-policy-server"])
+    with pytest.raises(SystemExit, match="1"):
+        cli.policy_server()
+    assert re.search(
+        r'^error: pf2mp-policy-server needs: pip install "lerobot_policy_pf2mp\[async\]"',
+        capsys.readouterr().err,
+    )
