@@ -87,7 +87,7 @@ def _usable(
     n_usable = 0
     for recording in recordings:
         joints, places, heights = _ways(recording, env, n_steps)
-        if (np.abs(heights) > INK_HEIGHT).any():
+        if (heights > INK_HEIGHT).any():
             left_out["with the pen off the table"] += 1
         elif _collides(env, joints):
             left_out["in collision"] += 1

@@ -18,10 +18,10 @@ class ConfigError(ParsingError):
 
 @contextmanager
 def reported_on_the_command_line() -> Iterator[None]:
-    """Turns a ValueError of the block into a `ConfigError` with the same message."""
+    """Turns a ValueError or OSError of the block into a `ConfigError` with the same message."""
     try:
         yield
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         raise ConfigError(str(error)) from error
 
 

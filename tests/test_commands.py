@@ -110,16 +110,16 @@ def test_unknown_options_end_with_the_usage_and_nothing_written(tmp_path: Path) 
                 "of which 1 is the largest (100 N)",
                 "by default 80 for a maze, 48 for Fetch",
                 "by default 4000 for a maze, 1000 for Fetch",
-                "fetch_reach or fetch_push",
+                "handwriting_joint or handwriting_pen.",
                 "x, y of the wall's centre [m]",
-                "width of a camera's pictures [pixels]",
+                "Width of these pictures, for a maze their longer side [pixels]",
             ],
         ),
         ("pf2mp-convert", [*MAZES, "by default local/TASK", "by default 80 for a maze, 48 for Fetch"]),
         (
             "pf2mp-plot",
             [
-                "lambda, density, arrows, trajectories, overview, flow or video",
+                "lambda, density, arrows, trajectories, overview, strokes, flow or video",
                 "collision and success rate against lambda",
                 "PNG, GIF for flow, MP4 for video",
                 "light or dark",
@@ -192,7 +192,8 @@ def test_ctrl_c_and_sigterm_in_the_middle_of_collecting_leave_nothing_behind(
     [
         (
             ["--task=kitchen"],
-            "error: task must be one of ['maze_umaze', 'maze_medium', 'maze_large', 'fetch_reach', 'fetch_push'], got",
+            "error: task must be one of ['maze_umaze', 'maze_medium', 'maze_large', 'fetch_reach', 'fetch_push', "
+            "'handwriting_joint', 'handwriting_pen'], got",
         ),
         (["--n_episodes=0"], "error: n_episodes must be at least 1, got 0"),
         (["--n_episodes=-5"], "error: n_episodes must be at least 1, got -5"),
@@ -323,7 +324,7 @@ def test_convert_reads_minari_and_stops_at_the_number_asked_for(
         (["--source.path=.", "--source.type=minari"], "error: . must hold a Minari dataset"),
         (
             ["--source.path=good.hdf5", "--source.type=rlds"],
-            "error: --source.type must be one of ['d4rl', 'minari', 'fetch']",
+            "error: --source.type must be one of ['d4rl', 'minari', 'fetch', 'handwriting']",
         ),
         (["--source.path=good.hdf5", "--task=maze"], "error: task must be one of"),
         (["--source.path=good.hdf5", "--n_steps=0"], "error: n_steps must be at least 2, got 0"),

@@ -160,11 +160,11 @@ def test_joints_and_their_controllers_have_one_order(exact: HandwritingEnv) -> N
     assert (model.actuator_ctrlrange[:, 1] >= model.jnt_range[:, 1]).all()
 
 
-def test_at_home_the_pen_is_upright_above_the_middle_of_the_sheet(exact: HandwritingEnv) -> None:
+def test_at_home_the_pen_is_nearly_upright_5_mm_below_the_middle_of_the_sheet(exact: HandwritingEnv) -> None:
     exact.check_joints(HOME, "home")
     x, y, z = exact.kinematics.tips(HOME[None])[0]
     np.testing.assert_allclose([x, y], SHEET_CENTRE, atol=0.001)
-    assert 0 <= z < 0.01
+    assert z == pytest.approx(-0.005, abs=0.001)
     upright = exact.kinematics.joints(np.array([x, y]), height=z)
     np.testing.assert_allclose(HOME, upright, atol=0.003)
 
@@ -257,22 +257,13 @@ def test_joints_for_a_place_are_those_next_to_home(exact: HandwritingEnv) -> Non
         assert np.abs(jacobian[:, :7] @ free).max() < 1e-9
 
 
-def test_joints_for_a_place_are_the_same_from_every_other_place(exact: HandwritingEnv) -> None:
-    places = np.array(
-        list(itertools.product(np.linspace(LOW[0], HIGH[0], 4), np.linspace(LOW[1], HIGH[1], 4)))
-    )
-    joints = [exact.kinematics.joints(place) for place in places]
-    for (place, expected), near in itertools.product(zip(places, joints, strict=True), joints):
-        np.testing.assert_allclose(exact.kinematics.joints(place, near=near), expected, atol=1e-4)
-
-
-def test_joints_for_a_place_are_the_same_from_every_other_posture(exact: HandwritingEnv) -> None:
+def test_joints_for_a_place_do_not_depend_on_what_was_asked_before(exact: HandwritingEnv) -> None:
     rng = np.random.default_rng(0)
-    low, high = exact._model.jnt_range.T
     for _ in range(30):
         place = rng.uniform(LOW, HIGH)
-        joints = exact.kinematics.joints(place, near=rng.uniform(low, high))
-        np.testing.assert_allclose(joints, exact.kinematics.joints(place), atol=1e-4)
+        joints = exact.kinematics.joints(place)
+        exact.kinematics.joints(rng.uniform(LOW, HIGH))
+        assert np.array_equal(exact.kinematics.joints(place), joints)
 
 
 @pytest.mark.parametrize(
@@ -353,7 +344,7 @@ def test_a_new_stroke_begins_after_a_lift_and_the_way_between_is_not_drawn() -> 
 
 def test_a_way_in_several_parts_leaves_the_same_ink_as_in_one() -> None:
     rng = np.random.default_rng(0)
-    tips = (*np.cumsum(rng.normal(0, 0.004, size=(200, 3)), axis=0), 0.45, 0, 0)
+    tips = np.array([0.45, 0.0, 0.0]) + np.cumsum(rng.normal(0, 0.004, size=(200, 3)), axis=0)
     tips[:, 2] = 0.02 + 0.02 * np.sin(np.arange(200) / 6)  # down every 38 places
     whole, parts = Ink(scene_with(BAR, DISC)), Ink(scene_with(BAR, DISC))
     clearance = whole.draw(tips)
@@ -562,6 +553,7 @@ def test_episodes_start_on_the_table_beside_the_beginning_of_the_letter(env: Han
                 observation["agent_pos"], env.kinematics.joints(tip[:2]), atol=1e-4
             )  # upright
     offsets = np.array(offsets)
+    assert START_SPREAD == 0.005
     assert np.abs(offsets).max() <= START_SPREAD + 1e-5
     assert (offsets.min(axis=0) < -0.6 * START_SPREAD).all()
     assert (offsets.max(axis=0) > 0.6 * START_SPREAD).all()
@@ -829,6 +821,16 @@ def test_a_pen_pressed_through_the_table_collides_with_its_barrel(envs: dict, co
         assert steps[-1][-1]["is_collision"] == collides
         assert sum(rewards_of(steps)) == -collides
         assert (steps[-1][-1]["clearance"] < 0) == collides
+
+
+def test_a_touch_that_ends_before_the_control_step_does_is_a_collision(physics: HandwritingEnv) -> None:
+    place = np.array([0.45, 0.12])
+    physics.reset(options={"joints": physics.kinematics.joints(place, height=-PEN_TRAVEL - 0.003)})
+    _, reward, _, _, info = physics.step(physics.kinematics.joints(place, height=0.05))
+    assert lowest_point(physics)[2] > 0.01
+    assert info["is_collision"]
+    assert info["clearance"] < 0
+    assert reward == -1
 
 
 @pytest.mark.parametrize("control", CONTROLS)
@@ -1208,30 +1210,34 @@ def test_pictures_from_the_top_leave_out_the_arm_and_from_the_side_show_it(
         assert is_red(pictures[0]).mean() > 0.002
 
 
-def test_two_environments_rendered_in_turns_do_not_disturb_each_other(
-    arm_camera: HandwritingEnv, top_camera: HandwritingEnv
-) -> None:
+def test_two_environments_rendered_in_turns_do_not_disturb_each_other() -> None:
+    envs = [
+        HandwritingEnv(
+            "pen", letter, control="exact", render_mode="rgb_array", render_size=size, camera=camera
+        )
+        for letter, size, camera in (("L", 160, "arm"), ("S", 240, "top"))
+    ]
     alone = []
-    for env in (arm_camera, top_camera):
+    for env in envs:
         draw_letter(env, 20)
-        alone.append(env.render())
-    for env in (arm_camera, top_camera):
-        draw_letter(env, 20)
+        alone.append(env.render())  # of a new renderer
     for _ in range(2):
-        np.testing.assert_array_equal(arm_camera.render(), alone[0])
-        np.testing.assert_array_equal(top_camera.render(), alone[1])
-    arm_camera.reset(seed=0)
-    arm_camera.render()
-    np.testing.assert_array_equal(top_camera.render(), alone[1])
+        for env, expected in zip(envs, alone, strict=True):
+            np.testing.assert_array_equal(env.render(), expected)
+    envs[0].reset(seed=0)
+    assert (envs[0].render() != alone[0]).any()
+    np.testing.assert_array_equal(envs[1].render(), alone[1])
+    for env in envs:
+        env.close()
 
 
 def test_a_sheet_full_of_strokes_can_be_rendered(top_camera: HandwritingEnv) -> None:
     rng = np.random.default_rng(0)
     top_camera.reset(seed=0)
-    for place in rng.uniform(np.array(SHEET_CENTRE) - 0.06, np.array(SHEET_CENTRE) + 0.06, size=(64, 2)):
+    for place in rng.uniform(np.array(SHEET_CENTRE) - 0.12, np.array(SHEET_CENTRE) + 0.12, size=(64, 2)):
         top_camera.step(place)
-    assert top_camera.ink.length > 3.5
-    assert is_blue(top_camera.render()).mean() > 0.02
+    assert top_camera.ink.length > 7
+    assert is_blue(top_camera.render()).mean() > 0.05
 
 
 @pytest.mark.parametrize(("size", "shape"), [(32, (24, 32, 3)), (127, (96, 126, 3)), (800, (600, 800, 3))])

@@ -34,7 +34,7 @@ PACKAGES = (
     "minari",
     "accelerate",
 )
-ESSENTIAL = ("python", *PACKAGES, "discovery", "device")
+ESSENTIAL = ("python", *PACKAGES, "discovery", "device", "simulation")
 OTHERS = ("lerobot-train", "rendering", "video", "experts", "async (grpc)", "peft", "wandb")
 # Trials that do not answer in time are as good as none, where only the rest matters.
 WITHOUT_TRIALS = "--time_limit=0.001"
@@ -116,6 +116,12 @@ def info(site_packages: Path, *options: str, **changes: str) -> subprocess.Compl
     return run(python, "-c", "from pf2mp_info.command import main; main()", *options, **changes)
 
 
+def discovery(site_packages: Path) -> dict[str, str]:
+    """The line of the discovery alone."""
+    code = "import json, pf2mp_info.trials as t; print(json.dumps(vars(t.trial_line('discovery', 300))))"
+    return json.loads(run(site_packages.parents[2] / "bin" / "python", "-c", code).stdout)
+
+
 @pytest.mark.slow
 def test_here_everything_essential_is_well() -> None:
     lines = lines_of(run(BIN / "pf2mp-info", "--json=true"))
@@ -130,6 +136,7 @@ def test_here_everything_essential_is_well() -> None:
     assert lines["discovery"]["value"] == (
         f"policies {', '.join(sorted(policies))}; environments {', '.join(sorted(environments))}"
     )
+    assert lines["simulation"]["value"] == "PointMaze_UMaze-v3, FetchReach-v4"
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else ""
     assert gpu in lines["device"]["value"]
     assert lines["experts"]["value"] == f"stable-baselines3 {version('stable-baselines3')}"
@@ -147,6 +154,16 @@ def test_without_a_screen_glfw_does_not_render_which_is_said_and_is_not_essentia
     (rendering,) = (row for row in rows if row.startswith("rendering"))
     assert "no pictures of Fetch and handwriting" in rendering
     assert "optional: try without MUJOCO_GL: RuntimeError: rendering without a screen needs EGL" in rendering
+
+
+@pytest.mark.slow
+def test_a_mujoco_that_cannot_be_imported_is_a_problem() -> None:
+    lines = lines_of(run(BIN / "pf2mp-info", "--json=true", MUJOCO_GL="glue"))
+    assert {name for name, line in lines.items() if line["status"] == "problem"} == {"simulation"}
+    assert lines["simulation"]["value"] == "no MuJoCo"
+    reason = "try without MUJOCO_GL: RuntimeError: invalid value for environment variable MUJOCO_GL: glue"
+    assert lines["simulation"]["remedy"] == reason
+    assert lines["rendering"]["status"] == "optional"
 
 
 def break_nothing(site_packages: Path) -> None:
@@ -212,14 +229,10 @@ def test_if_lerobot_does_not_find_the_package_the_report_says_why(
     site_packages: Path, break_it: Callable[[Path], None], reason: str
 ) -> None:
     break_it(site_packages)
-    lines = lines_of(info(site_packages, "--json=true"))
-    assert lines["discovery"]["remedy"].startswith(reason.format(env=site_packages.parents[2]))
-    assert lines["discovery"]["status"] == ("problem" if reason else "ok")
-    wrong = {"discovery"} if reason else set()
-    if break_it is break_by_not_installing:
-        wrong |= {"lerobot_policy_pf2mp"}
-    assert "no_such_module" not in lines["discovery"]["remedy"]
-    assert {name for name, line in lines.items() if line["status"] == "problem"} == wrong
+    line = discovery(site_packages)
+    assert line["status"] == ("problem" if reason else "ok")
+    assert line["remedy"].startswith(reason.format(env=site_packages.parents[2]))
+    assert "no_such_module" not in line["remedy"]
 
 
 @pytest.mark.slow
@@ -235,6 +248,7 @@ def test_without_lerobot_torch_and_draccus_the_report_is_complete_nevertheless(s
         "discovery": "LeRobot's discovery does not run: ModuleNotFoundError: No module named 'lerobot'",
         "device": "ModuleNotFoundError: No module named 'torch': install a torch that runs here "
         "(pytorch.org/get-started/locally)",
+        "simulation": "ModuleNotFoundError: No module named 'packaging'",
     }
     assert lines["video"]["status"] == "optional"
     assert lines["video"]["remedy"].startswith("ModuleNotFoundError: No module named 'av': pip install ")
@@ -265,6 +279,7 @@ def test_versions_outside_of_what_is_asked_for_are_problems(site_packages: Path)
     assert found.pop("python")[1] == "must be >=3.12,>=3.99: install into an environment of such a Python"
     assert found.pop("discovery")[1].endswith("no answer within 0.001 s (--time_limit)")
     assert found.pop("device")[1].startswith("no answer within 0.001 s (--time_limit)")
+    assert found.pop("simulation") == ("no MuJoCo", "no answer within 0.001 s (--time_limit)")
     assert found == {
         "mujoco": ("3.12.0", 'pip install "mujoco<3.12,>=3.3"'),
         "lerobot": ("0.7.0", 'pip install "lerobot<0.7,>=0.6.1"'),

@@ -24,13 +24,14 @@ DISTRIBUTION = "lerobot_policy_pf2mp"
 PACKAGE = "lerobot_pf2mp"
 
 _BALL = "<mujoco><worldbody><light pos='0 0 3'/><geom size='1'/></worldbody></mujoco>"
+_SIMULATIONS = ("PointMaze_UMaze-v3", "FetchReach-v4")
 _SIDE = 64  # of the pictures [pixels]
 _LONGEST = 300  # of what an error says [characters]
 
 
 def said_by(error: BaseException) -> str:
     """Type and message of an error in one line of bounded length."""
-    words = " ".join(f"{type(error).__name__}: {error}".split())
+    words = " ".join([type(error).__name__ + ":" * bool(str(error)), *str(error).split()])
     return words if len(words) <= _LONGEST else words[: _LONGEST - 3] + "..."
 
 
@@ -84,6 +85,26 @@ def device() -> dict[str, Any]:
     return answer
 
 
+def simulation() -> dict[str, Any]:
+    """Which of the simulations that our environments are built on run; their errors by name."""
+    import gymnasium
+    import gymnasium_robotics
+    import mujoco  # noqa: F401
+
+    gymnasium.register_envs(gymnasium_robotics)
+    errors = {}
+    for name in _SIMULATIONS:
+        try:
+            env = gymnasium.make(name)
+            env.reset(seed=0)
+            env.step(env.action_space.sample())
+            env.close()
+            errors[name] = ""
+        except Exception as error:
+            errors[name] = said_by(error)
+    return {"errors": errors}
+
+
 def rendering() -> dict[str, Any]:
     """How MuJoCo renders, found by rendering a picture in the way of our environments."""
     with _headless().rendering():
@@ -120,7 +141,7 @@ def video() -> dict[str, Any]:
     return answer
 
 
-PROBES = {probe.__name__: probe for probe in (discovery, device, rendering, video)}
+PROBES = {probe.__name__: probe for probe in (discovery, device, simulation, rendering, video)}
 
 
 def _ours(choices: dict[str, type]) -> list[str]:

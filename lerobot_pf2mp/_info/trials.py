@@ -75,11 +75,20 @@ def device_line(answer: dict[str, Any]) -> Line:
     return Line("device", value)
 
 
+def simulation_line(answer: dict[str, Any]) -> Line:
+    """Whether MuJoCo and the environments of gymnasium-robotics run."""
+    errors = {"MuJoCo": answer["error"]} if "error" in answer else answer["errors"]
+    value = ", ".join(name if not error else f"no {name}" for name, error in errors.items())
+    reasons = "; ".join(error for error in errors.values() if error)
+    if reasons:
+        return Line("simulation", value, PROBLEM, _without("MUJOCO_GL") + reasons)
+    return Line("simulation", value)
+
+
 def rendering_line(answer: dict[str, Any]) -> Line:
     """Which backend renders."""
     if "error" in answer:
-        chosen = " and ".join(name for name in ("MUJOCO_GL", "DISPLAY") if os.environ.get(name))
-        remedy = f"try without {chosen}: {answer['error']}" if chosen else answer["error"]
+        remedy = _without("MUJOCO_GL", "DISPLAY") + answer["error"]
         return Line("rendering", "no pictures of Fetch and handwriting", OPTIONAL, remedy)
     return Line("rendering", _BACKENDS.get(answer["backend"], answer["backend"]))
 
@@ -93,12 +102,15 @@ def video_line(answer: dict[str, Any]) -> Line:
         encoder if not reason else f"no {encoder}" for encoder, reason in answer["encoders"].items()
     )
     reasons = "; ".join(reason for reason in answer["encoders"].values() if reason)
-    return Line("video", value, OPTIONAL, f"{reasons}: {remedy}") if reasons else Line("video", value)
+    if reasons:
+        return Line("video", value, OPTIONAL, f"{reasons}: {remedy}")
+    return Line("video", value)
 
 
 LINES = {
     "discovery": discovery_line,
     "device": device_line,
+    "simulation": simulation_line,
     "rendering": rendering_line,
     "video": video_line,
 }
@@ -120,6 +132,12 @@ def train_line() -> Line:
     if interpreter and interpreter.parent.resolve() != folder.resolve():
         return Line(name, f"the one in PATH runs {interpreter}", OPTIONAL, remedy)
     return Line(name, "of this environment")
+
+
+def _without(*variables: str) -> str:
+    """The advice to try without those of these variables that are set."""
+    chosen = " and ".join(name for name in variables if os.environ.get(name))
+    return f"try without {chosen}: " if chosen else ""
 
 
 def _interpreter_of(script: Path) -> Path | None:

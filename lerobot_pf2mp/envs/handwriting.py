@@ -23,11 +23,9 @@ from lerobot_pf2mp.envs.sheet import (
     LETTER_HEIGHT,
     N_REGIONS,
     REGION_GAP,
-    SHEET_CENTRE,
-    SHEET_SIDE,
 )
 from lerobot_pf2mp.envs.sheet_picture import draw_sheet
-from lerobot_pf2mp.envs.writing_scene import check_on_sheet, make_writing_scene
+from lerobot_pf2mp.envs.writing_scene import SHEET_CORNERS, check_on_sheet, make_writing_scene
 
 SPACES = ("joint", "pen")
 CONTROLS = ("physics", "exact")
@@ -43,8 +41,8 @@ class HandwritingEnv(gym.Env):
 
     ## Description
     The Franka Panda of gymnasium-robotics holds a pen over a white table, as in Sections V-D and V-E of the paper. The
-    letter, grey, and the regions, red, are on a sheet in front of it. The pen draws wherever its tip is within 5 mm of the
-    table. The frame is that of the arm's base: x forward, y to its left [m].
+    letter, grey, and the regions, red, are on a sheet in front of it. The pen draws wherever its tip is at most 7 mm
+    above the table. The frame is that of the arm's base: x forward, y to its left [m].
 
     ## Action space
     ``space="joint"``: ``Box(9)``, the next positions of the seven joints [rad] and the two fingers [m]. ``space="pen"``:
@@ -174,14 +172,14 @@ class HandwritingEnv(gym.Env):
                 f"an action must be {self.action_space.shape[0]} finite positions, got {np.asarray(action).tolist()}"
             )
         target = target.clip(self.action_space.low, self.action_space.high)
-        joints = target if self._space == "joint" else self.kinematics.joints(target, near=self._target)
-        tips, depth = self._move_exactly(joints) if self._control == "exact" else self._drive(joints)
+        joints = target if self._space == "joint" else self.kinematics.joints(target)
+        move = self._move_exactly if self._control == "exact" else self._drive
+        tips, table_clearance = move(joints)
         self._target = joints
         ink_clearance = self.ink.draw(tips)
-        is_touching = depth > 0 or ink_clearance < 0
+        is_touching = min(table_clearance, ink_clearance) < 0
         is_first = is_touching and not self._is_collision
         self._is_collision |= is_touching
-        table_clearance = -depth if depth > 0 else self._table.clearance()
         info = self._info(min(ink_clearance, table_clearance))
         return self._observation(), -1.0 if is_first else 0.0, False, False, info
 
@@ -217,41 +215,52 @@ class HandwritingEnv(gym.Env):
     def _first_joints(self, options: dict[str, Any]) -> np.ndarray:
         if options.get("joints") is not None:
             joints = np.asarray(options["joints"], dtype=np.float64)
+            if joints.ndim != 1:
+                raise ValueError(f"joints must be 9 finite positions, got an array of shape {joints.shape}")
             self.check_joints(joints, "joints")
             return joints
         start = options.get("start")
         if start is None:
             start = self.scene.stroke[0] + self.np_random.uniform(-START_SPREAD, START_SPREAD, 2)
+            start = start.clip(*SHEET_CORNERS)
         start = np.asarray(start, dtype=np.float64)
+        if start.shape != (2,):
+            raise ValueError(f"start must be finite places x, y [m], got {start.tolist()}")
         check_on_sheet(start, "start")
         return self.kinematics.joints(start)
 
     def _move_exactly(self, target: np.ndarray) -> tuple[np.ndarray, float]:
-        """The tip's positions ``(N, 3)`` on the way, and how deep the arm was in the table [m]."""
+        """The tip's positions ``(N, 3)`` on the way, and the smallest distance of the arm to the table [m]."""
         start = self._data.qpos.copy()
         n = int(np.clip(math.ceil(np.abs(target - start).max() / _LARGEST_SWEEP), 1, _MAX_SWEEPS))
-        tips, depth = [self._tip.copy()], 0.0
+        tips, clearance = [self._tip.copy()], math.inf
         for share in np.arange(1, n + 1) / n:
             self._data.qpos[:] = start + share * (target - start)
             mujoco.mj_fwdPosition(self._model, self._data)
-            depth = max(depth, self._table.contact_depth())
+            clearance = min(clearance, self._table_clearance())
             tips.append(self._tip.copy())
-        return np.array(tips), depth
+        return np.array(tips), clearance
 
     def _drive(self, target: np.ndarray) -> tuple[np.ndarray, float]:
         """The same in full physics, while the controllers' set points move evenly to the target."""
         before = self._target
-        tips, depth = [self._tip.copy()], 0.0
+        tips, clearance = [self._tip.copy()], math.inf
         for substep in range(1, self._n_substeps + 1):
             self._data.ctrl[:] = before + substep / self._n_substeps * (target - before)
             mujoco.mj_step(self._model, self._data)
-            depth = max(depth, self._table.contact_depth())
             if substep % _STEPS_BETWEEN_TIPS == 0:
                 tips.append(self._tip.copy())
+                clearance = min(clearance, self._table_clearance())
+            elif self._table.contact_depth() > 0:
+                clearance = min(clearance, -self._table.contact_depth())
         # A physics step looks for contacts, and where the pen is, before it moves.
         mujoco.mj_fwdPosition(self._model, self._data)
         tips.append(self._tip.copy())
-        return np.array(tips), max(depth, self._table.contact_depth())
+        return np.array(tips), min(clearance, self._table_clearance())
+
+    def _table_clearance(self) -> float:
+        depth = self._table.contact_depth()
+        return -depth if depth > 0 else self._table.clearance()
 
     def _observation(self) -> dict[str, np.ndarray]:
         measured = self._data.qpos if self._space == "joint" else self._tip[:2]
@@ -278,7 +287,7 @@ def _action_space(space: str, model: mujoco.MjModel) -> spaces.Box:
     if space == "joint":
         low, high = model.jnt_range.T
     else:
-        low, high = np.array(SHEET_CENTRE) - SHEET_SIDE / 2, np.array(SHEET_CENTRE) + SHEET_SIDE / 2
+        low, high = SHEET_CORNERS
     return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from lerobot_pf2mp.envs.stroke import distances, evenly_spaced, line_of
 from lerobot_pf2mp.envs.writing_scene import WritingScene
 
-INK_HEIGHT = 0.005  # distance of the tip to the table within which the pen draws [m]
+INK_HEIGHT = 0.007  # height of the tip up to which the pen draws [m]
 COVERED = 0.015  # distance of the letter to the ink within which it counts as drawn [m]
 LARGEST_ERROR = 0.01  # mean distance of the ink to the letter [m]
 
@@ -29,8 +29,7 @@ class Ink:
         self.strokes: list[np.ndarray] = []  # each (N, 2) places [m]
         self.length = 0.0  # of all strokes [m]
         self._is_covered = np.zeros(len(scene.stroke), dtype=bool)
-        self._sum_of_errors = 0.0
-        self._n_errors = 0
+        self._integral = 0.0  # of the ink's distance to the letter over its length [m^2]
         self._is_down = False
 
     def draw(self, tips: np.ndarray) -> float:
@@ -42,7 +41,7 @@ class Ink:
         Returns:
             Smallest distance of what was drawn now to a region [m], negative inside; inf if nothing was drawn.
         """
-        is_down = np.abs(tips[:, 2]) <= INK_HEIGHT
+        is_down = tips[:, 2] <= INK_HEIGHT
         clearance = math.inf
         ends = np.flatnonzero(np.diff(is_down.astype(int))) + 1
         for part in np.split(np.arange(len(tips)), ends):
@@ -54,7 +53,7 @@ class Ink:
     @property
     def error(self) -> float:
         """Mean distance of the ink to the letter [m]; inf before anything is drawn."""
-        return self._sum_of_errors / self._n_errors if self._n_errors else math.inf
+        return self._integral / self.length if self.length else math.inf
 
     @property
     def is_success(self) -> bool:
@@ -70,6 +69,6 @@ class Ink:
         self.length += line.length
         self._is_covered |= distances(self._scene.stroke, places) <= COVERED
         errors = distances(evenly_spaced(places, _SPACING)[1:], self._scene.stroke)
-        self._sum_of_errors += float(errors.sum())
-        self._n_errors += len(errors)
+        if len(errors):
+            self._integral += float(errors.mean()) * line.length
         return self._scene.clearance(places)

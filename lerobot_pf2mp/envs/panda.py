@@ -15,8 +15,8 @@ N_ARM_JOINTS = 7
 JOINT_NAMES = (*(f"joint_{i}" for i in range(1, N_ARM_JOINTS + 1)), "finger_1", "finger_2")
 TABLE, PEN_TIP = "table", "pen_tip"
 GRIP = 0.007  # opening of each finger around the pen [m]
-# A posture with the pen upright above the middle of the sheet; of all postures for a place of the pen, the arm takes the
-# one next to this.
+# A posture with the pen nearly upright at the middle of the sheet, its tip 5 mm too low; of all postures for a place of the
+# pen, the arm takes the one next to this.
 HOME = np.array([0.0, 0.3125, 0.0, -2.3932, 0.0, 1.135, 0.7854, GRIP, GRIP])  # [rad], fingers [m]
 ARM_GROUP, SCENE_GROUP = 0, 1  # of visible geoms
 PEN_TRAVEL = 0.01  # how far the tip gives way before the pen itself touches the table [m]

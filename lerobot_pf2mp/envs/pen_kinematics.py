@@ -35,12 +35,11 @@ class PenKinematics:
         self._posture.set_target(HOME)
         self._limits = [mink.ConfigurationLimit(model)]
 
-    def joints(self, place: np.ndarray, near: np.ndarray = HOME, height: float = 0.0) -> np.ndarray:
+    def joints(self, place: np.ndarray, height: float = 0.0) -> np.ndarray:
         """Joint positions ``(9,)`` with the pen upright at a place [rad], fingers [m].
 
         Args:
             place: ``(2,)`` x, y of the pen's tip [m].
-            near: ``(9,)`` joint positions to search from.
             height: z of the pen's tip [m].
 
         Raises:
@@ -48,7 +47,7 @@ class PenKinematics:
         """
         target = mink.SO3.from_matrix(_UPRIGHT), np.array([*place, height])
         self._pen.set_target(mink.SE3.from_rotation_and_translation(*target))
-        self._configuration.update(near)
+        self._configuration.update(HOME)  # from elsewhere the search may go astray
         for _ in range(_MAX_ITERATIONS):
             velocity = mink.solve_ik(
                 self._configuration, [self._pen, self._posture], 1.0, "daqp", limits=self._limits
@@ -66,10 +65,7 @@ class PenKinematics:
         Raises:
             ValueError: If the arm does not reach one of them.
         """
-        joints = [self.joints(places[0])]
-        for place in places[1:]:
-            joints.append(self.joints(place, near=joints[-1]))
-        return np.array(joints)
+        return np.array([self.joints(place) for place in places])
 
     def tips(self, joints: np.ndarray) -> np.ndarray:
         """Positions ``(N, 3)`` of the pen's tip for ``(N, 9)`` joint positions [m]."""

@@ -106,12 +106,27 @@ def region_of(content: Any) -> Region:
     """
     try:
         if set(content) == {"centre", "radius"}:
-            return Disc(tuple(content["centre"]), float(content["radius"]))
+            return Disc(tuple(_numbers(content["centre"])), float(_numbers(content["radius"])))
         if set(content) == {"corners"}:
-            return Area(tuple(tuple(corner) for corner in content["corners"]))
+            return Area(tuple(tuple(corner) for corner in _numbers(content["corners"])))
     except TypeError:
         pass  # not numbers where there should be numbers: the message below says what should be there
     raise ValueError(
         'a region must be {"centre": [x, y], "radius": r} or {"corners": [[x, y], ...]} in metres, '
         f"got {content}"
     )
+
+
+def _numbers(content: Any) -> Any:
+    """The content, if it is numbers in rows of one length.
+
+    Raises:
+        TypeError: If it is not.
+    """
+    try:
+        numbers = np.array(content)
+    except ValueError as error:
+        raise TypeError("rows of different lengths") from error
+    if numbers.dtype.kind not in "iuf":
+        raise TypeError("no numbers")
+    return numbers.tolist()

@@ -18,7 +18,7 @@ from lerobot_pf2mp.envs.regions import Disc, Region, region_of
 from lerobot_pf2mp.envs.sheet import LETTER_HEIGHT, N_REGIONS, REGION_GAP, SHEET_CENTRE, SHEET_SIDE
 from lerobot_pf2mp.envs.stroke import distances, evenly_spaced, line_of
 
-_LOW, _HIGH = np.array(SHEET_CENTRE) - SHEET_SIDE / 2, np.array(SHEET_CENTRE) + SHEET_SIDE / 2
+SHEET_CORNERS = np.array(SHEET_CENTRE) - SHEET_SIDE / 2, np.array(SHEET_CENTRE) + SHEET_SIDE / 2
 _SPACING = 0.001  # of the letter's points [m]
 _RADII = (0.006, 0.045)  # smallest and largest of a letter's regions [m]
 _GRID = 0.002  # of the places where a region may be put [m]
@@ -59,7 +59,8 @@ class WritingScene:
 
 def is_on_sheet(places: np.ndarray) -> bool:
     """Whether all of ``(..., 2)`` places x, y [m] are on the sheet."""
-    return bool((places >= _LOW).all() and (places <= _HIGH).all())
+    low, high = SHEET_CORNERS
+    return bool((places >= low).all() and (places <= high).all())
 
 
 def check_on_sheet(places: np.ndarray, name: str) -> None:
@@ -71,7 +72,7 @@ def check_on_sheet(places: np.ndarray, name: str) -> None:
     if places.ndim < 1 or places.shape[-1] != 2 or not np.isfinite(places).all():
         raise ValueError(f"{name} must be finite places x, y [m], got {places.tolist()}")
     if not is_on_sheet(places):
-        low, high = _LOW, _HIGH
+        low, high = SHEET_CORNERS
         outside = next(place for place in places.reshape(-1, 2) if not is_on_sheet(place))
         raise ValueError(
             f"{name} must lie on the sheet, where the arm reaches with an upright pen, x in [{low[0]:g}, {high[0]:g}] "
@@ -111,7 +112,9 @@ def make_writing_scene(
         raise ValueError(f"region_gap must be above 0 m, got {region_gap}")
     if n_regions < 0:
         raise ValueError(f"n_regions must be at least 0, got {n_regions}")
-    stroke = evenly_spaced(np.array(SHEET_CENTRE) + letter_height * letter_stroke(letter), _SPACING)
+    whole = np.array(SHEET_CENTRE) + letter_height * letter_stroke(letter)
+    check_on_sheet(whole, f"the stroke of {letter}")  # before it is divided into millimetres
+    stroke = evenly_spaced(whole, _SPACING)
     return WritingScene(letter, stroke, _regions_in_the_bays(stroke, region_gap, n_regions))
 
 
@@ -136,7 +139,9 @@ def read_writing_scene(path: Path) -> WritingScene:
     regions = content.get("regions", [])
     if not isinstance(regions, list):
         raise ValueError(f"the regions in {path} must be a list, got {regions}")
-    stroke = evenly_spaced(_places(content["stroke"], path), _SPACING)
+    places = _places(content["stroke"], path)
+    check_on_sheet(places, f"the stroke of {path.stem}")
+    stroke = evenly_spaced(places, _SPACING)
     return WritingScene(path.stem, stroke, tuple(region_of(region) for region in regions))
 
 

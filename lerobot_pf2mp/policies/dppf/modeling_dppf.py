@@ -40,8 +40,23 @@ class DPPFPolicy(WithModelCard, DiffusionPolicy):
         dataset_meta: Any = None,
         **kwargs: Any,
     ) -> None:
+        self._guidance = PotentialFieldGuidance(
+            config, dataset_stats
+        )  # first, as DiffusionPolicy resets itself
         super().__init__(config)
-        self._guidance = PotentialFieldGuidance(config, dataset_stats)
+
+    def reset(self) -> None:
+        """Forgets past observations and planned actions; to be called when an episode begins."""
+        super().reset()
+        self._guidance.monitor.reset()
+
+    @property
+    def support(self) -> Tensor | None:
+        """``(B, T)`` how far the last chunk's actions are inside the demonstrated region [nats], negative outside.
+
+        The log density above the field's threshold; None before the first chunk and with ``on_unsupported=ignore``.
+        """
+        return self._guidance.monitor.support
 
     def forward(self, batch: dict[str, Any]) -> tuple[Tensor, None]:
         """The loss of `DiffusionPolicy.forward`; in training, the batch's actions also go to the potential field."""
@@ -62,7 +77,8 @@ class DPPFPolicy(WithModelCard, DiffusionPolicy):
             guide: Bends every denoising step, in place of the configured guidance; None for that.
         """
         with self._guided(guide or self.make_guide(batch)):
-            return super().predict_action_chunk(self._with_window(batch), noise=noise)
+            chunk = super().predict_action_chunk(self._with_window(batch), noise=noise)
+        return self._guidance.check_chunk(batch, chunk)
 
     def make_guide(self, batch: dict[str, Any]) -> Guide | None:
         """The configured guide over the field in the batch; None with ``guidance_scale=0``.

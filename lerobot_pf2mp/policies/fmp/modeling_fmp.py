@@ -192,8 +192,8 @@ class FMPPolicy(WithModelCard, PreTrainedPolicy):
         )  # (B, T, A)
         start = self.config.n_obs_steps - 1
         if self._rtc_processor is not None:
-            return chunk[:, start:]
-        return chunk[:, start : start + self.config.n_action_steps]
+            return self.check_chunk(batch, chunk[:, start:])
+        return self.check_chunk(batch, chunk[:, start : start + self.config.n_action_steps])
 
     @torch.no_grad()
     def select_action(
@@ -229,6 +229,10 @@ class FMPPolicy(WithModelCard, PreTrainedPolicy):
     def make_guide(self, batch: dict[str, Any]) -> Guide | None:
         """What bends the flow for this batch: nothing."""
         return None
+
+    def check_chunk(self, batch: dict[str, Any], chunk: Tensor) -> Tensor:
+        """The actions ``(B, T, A)`` to execute of a planned chunk: all of them, as they are."""
+        return chunk
 
     @property
     def _observation_keys(self) -> list[str]:

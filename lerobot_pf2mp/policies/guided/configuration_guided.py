@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from lerobot.configs import PolicyFeature
 
 from lerobot_pf2mp.guidance import GUIDANCE_INTEGRATORS, GUIDANCE_POINTS
+from lerobot_pf2mp.policies.guided.support_monitor import ON_UNSUPPORTED
 from lerobot_pf2mp.potential_field_processor import FieldSettings
 
 
@@ -25,6 +26,8 @@ class GuidedConfig:
         guidance_integrator: proximal (solved exactly over a step, flat in lambda) or euler (Algorithm 2 as printed).
         guidance_point: Where the field is evaluated in each step: current (at A_t), end (at the end point that the step
             predicts) or next (after the step). None is the integrator's own: current for euler, end for proximal.
+        on_unsupported: What happens when planned actions leave the demonstrated region: ignore, warn or hold, see
+            `SupportMonitor`. It needs the field, also where guidance_scale is 0.
         n_field_points: Demonstrated actions M kept as anchors of the field.
         field_action_dims: Action dimensions the field covers; None covers all. A gripper's opening is usually left out.
         field_bandwidth: Kernel bandwidth h [normalised action units], or how to choose it: likelihood (leave-one-out
@@ -36,6 +39,7 @@ class GuidedConfig:
     guidance_scale: float = 0.8
     guidance_integrator: str = "proximal"
     guidance_point: str | None = None
+    on_unsupported: str = "ignore"
     n_field_points: int = 3000
     field_action_dims: tuple[int, ...] | None = None
     field_bandwidth: float | str = "likelihood"
@@ -64,6 +68,8 @@ class GuidedConfig:
             raise ValueError(
                 f"guidance_point must be one of {GUIDANCE_POINTS} or null, got {self.guidance_point!r}"
             )
+        if self.on_unsupported not in ON_UNSUPPORTED:
+            raise ValueError(f"on_unsupported must be one of {ON_UNSUPPORTED}, got {self.on_unsupported!r}")
         _ = self.field_settings  # validates the field's own values
 
     def _validate_field_dims(self, action_feature: PolicyFeature) -> None:

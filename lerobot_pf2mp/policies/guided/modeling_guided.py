@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from lerobot.utils.constants import ACTION
+from torch import Tensor
 
 from lerobot_pf2mp.flow_matching import Guide
 from lerobot_pf2mp.guidance import make_guide
+from lerobot_pf2mp.policies.guided.support_monitor import SupportMonitor
 from lerobot_pf2mp.potential_field import PotentialField
 from lerobot_pf2mp.potential_field_processor import POTENTIAL_FIELD, DemonstratedActions
 
@@ -36,6 +38,7 @@ class PotentialFieldGuidance:
         self.config = config
         self._dataset_id = _identify_dataset(dataset_stats, config)
         self.demonstrations: DemonstratedActions | None = None  # those of the last training batch
+        self.monitor = SupportMonitor(config.on_unsupported, config.field_action_dims)
 
     def observe(self, batch: dict[str, Any]) -> None:
         """Shows a training batch's actions to the field that the preprocessor put into it; without one, does nothing."""
@@ -73,6 +76,20 @@ class PotentialFieldGuidance:
             config.field_action_dims,
             config.guidance_point,
         )
+
+    def check_chunk(self, batch: dict[str, Any], chunk: Tensor) -> Tensor:
+        """The actions ``(B, T, A)`` to execute, after `SupportMonitor` has looked at them.
+
+        Args:
+            batch: A batch that the policy's own preprocessor has made.
+            chunk: ``(B, T, A)`` planned actions [normalised].
+
+        Raises:
+            ValueError: If the batch holds no field, or one over other dimensions.
+        """
+        if self.config.on_unsupported == "ignore":
+            return chunk
+        return self.monitor(chunk, fitted_field(batch.get(POTENTIAL_FIELD), self.config, chunk.device))
 
 
 def fitted_field(

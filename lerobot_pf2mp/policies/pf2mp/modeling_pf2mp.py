@@ -34,8 +34,21 @@ class PF2MPPolicy(FMPPolicy):
         dataset_meta: Any = None,
         **kwargs: Any,
     ) -> None:
+        self._guidance = PotentialFieldGuidance(config, dataset_stats)  # first, as FMPPolicy resets itself
         super().__init__(config, dataset_stats, dataset_meta, **kwargs)
-        self._guidance = PotentialFieldGuidance(config, dataset_stats)
+
+    def reset(self) -> None:
+        """Forgets past observations and planned actions; to be called when an episode begins."""
+        super().reset()
+        self._guidance.monitor.reset()
+
+    @property
+    def support(self) -> Tensor | None:
+        """``(B, T)`` how far the last chunk's actions are inside the demonstrated region [nats], negative outside.
+
+        The log density above the field's threshold; None before the first chunk and with ``on_unsupported=ignore``.
+        """
+        return self._guidance.monitor.support
 
     def forward(self, batch: dict[str, Any], reduction: str = "mean") -> tuple[Tensor, None]:
         """The loss of `FMPPolicy.forward`; in training, the batch's actions also go to the potential field."""
@@ -50,3 +63,7 @@ class PF2MPPolicy(FMPPolicy):
             ValueError: If the batch holds no field, or one over other dimensions.
         """
         return self._guidance.make_guide(batch, next(self.parameters()).device)
+
+    def check_chunk(self, batch: dict[str, Any], chunk: Tensor) -> Tensor:
+        """The actions ``(B, T, A)`` to execute of a planned chunk, see `on_unsupported`."""
+        return self._guidance.check_chunk(batch, chunk)

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Watches whether planned actions stay where demonstrations went, for the robot's sake."""
+
+from __future__ import annotations
+
+import logging
+
+import torch
+from torch import Tensor
+
+from lerobot_pf2mp.potential_field import PotentialField
+
+ON_UNSUPPORTED = ("ignore", "warn", "hold")
+
+logger = logging.getLogger(__name__)
+
+
+class SupportMonitor:
+    """Says how far each planned action leaves the demonstrated region, and may hold the robot where it was still inside.
+
+    An action is supported if its density is at least the field's threshold: at 0 nats or above in `support`.
+
+    Args:
+        on_unsupported: ignore (do nothing, not even look), warn (log a line for each chunk that leaves the region) or hold
+            (warn, and repeat the last supported action instead of each one that is not).
+        action_dims: Action dimensions that the field covers; None covers all.
+    """
+
+    def __init__(self, on_unsupported: str, action_dims: tuple[int, ...] | None = None) -> None:
+        self._on_unsupported = on_unsupported
+        self._dims = None if action_dims is None else list(action_dims)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets the last chunk; to be called when an episode begins."""
+        self.support: Tensor | None = None  # (B, T) log density above the threshold [nats] of the last chunk
+        self._last_supported: Tensor | None = None  # (B, A)
+
+    def __call__(self, chunk: Tensor, field: PotentialField) -> Tensor:
+        """The actions to execute.
+
+        Args:
+            chunk: ``(B, T, A)`` planned actions [normalised].
+            field: The potential field.
+
+        Returns:
+            ``(B, T, A)``: the same, or with hold those of them that are supported, each repeated until the next one. Before
+            the first one it is the last of the chunk before, in a first chunk the first supported one; without any, the
+            chunk stays as it is.
+        """
+        covered = chunk if self._dims is None else chunk[..., self._dims]
+        self.support = field.log_density(covered) - field.log_threshold  # (B, T)
+        is_supported = self.support >= 0
+        if not is_supported.all():
+            logger.warning(
+                "%d of %d planned actions leave the demonstrated region, by up to %.1f nats",
+                (~is_supported).sum().item(),
+                is_supported.numel(),
+                -self.support.min().item(),
+            )
+        return self._hold(chunk, is_supported) if self._on_unsupported == "hold" else chunk
+
+    def _hold(self, chunk: Tensor, is_supported: Tensor) -> Tensor:
+        steps = torch.arange(chunk.shape[1], device=chunk.device).expand_as(is_supported)
+        last = torch.where(is_supported, steps, -1).cummax(dim=1).values  # (B, T)
+        first = is_supported.int().argmax(dim=1)  # (B,)
+        robots = torch.arange(len(chunk), device=chunk.device)
+        before = chunk[robots, first] if self._last_supported is None else self._last_supported  # (B, A)
+        held = chunk.gather(1, last.clamp_min(0).unsqueeze(-1).expand_as(chunk))
+        held = torch.where((last >= 0).unsqueeze(-1), held, before.unsqueeze(1))
+        has_any = (
+            is_supported.any(dim=1)
+            if self._last_supported is None
+            else torch.ones_like(first, dtype=torch.bool)
+        )
+        held = torch.where(has_any.view(-1, 1, 1), held, chunk)
+        if has_any.all():
+            self._last_supported = held[:, -1]
+        return held
