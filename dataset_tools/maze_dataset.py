@@ -27,6 +27,8 @@ _FEATURES = {
     "action": {"dtype": "float32", "shape": (2,), "names": ["x", "y"]},
 }
 
+_GOAL = "| `observation.environment_state` | position x, y of the goal | m |"
+_PICTURES = "| `observation.image` | the maze from above | |"
 _CARD = """\
 ---
 license: apache-2.0
@@ -42,9 +44,8 @@ Every trajectory is resampled to {n_steps} steps by linear interpolation in time
 | feature | meaning | unit |
 |---|---|---|
 | `observation.state` | position x, y of the ball | m |
-| `observation.environment_state` | position x, y of the goal, unless there are pictures | m |
+{surroundings}
 | `action` | next position x, y of the ball | m |
-| `observation.image` | if present: the maze from above | |
 
 The origin is the centre of the map, x points east and y north; cells have sides of 1 m, the ball a radius of 0.1 m.
 Made with lerobot_policy_pf2mp.
@@ -90,7 +91,13 @@ def write_maze_dataset(
         trajectories = _with_pictures(trajectories, picture, n_steps)
         del features["observation.environment_state"]
         features[PICTURES] = picture_feature(picture.size)
-    card = _CARD.format(title=repo_id, origin=origin, n_steps=n_steps, fps=FPS)
+    card = _CARD.format(
+        title=repo_id,
+        origin=origin,
+        n_steps=n_steps,
+        fps=FPS,
+        surroundings=_PICTURES if picture_width else _GOAL,
+    )
     return write_trajectories(
         trajectories,
         root=root,

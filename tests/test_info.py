@@ -15,6 +15,8 @@ import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
+from pf2mp_info.trials import LINES
+from pf2mp_info.versions import EXTRAS, ranges
 
 import lerobot_pf2mp
 
@@ -291,6 +293,55 @@ def test_versions_outside_of_what_is_asked_for_are_problems(site_packages: Path)
         "mink": ("not installed", 'pip install "mink>=1.1"'),
     }
     assert (lines["experts"]["value"], lines["experts"]["status"]) == ("stable-baselines3 3.0.0", "optional")
+
+
+def test_the_extras_that_are_recommended_ask_for_their_packages() -> None:
+    wanted = ranges()
+    assert [package for package, _, _ in EXTRAS.values() if not wanted.get(package)] == []
+
+
+NO_GPU = {"cores": 2, "gpus": [], "mps": False, "said": ""}
+ENCODERS = {"libx264": "", "libsvtav1": "UnknownCodecError: libsvtav1"}
+
+
+@pytest.mark.parametrize(
+    ("trial", "answer", "line"),
+    [
+        ("device", NO_GPU, ("CPU, 2 cores", "ok", "")),
+        ("device", {**NO_GPU, "mps": True}, ("MPS", "ok", "")),
+        (
+            "device",
+            {**NO_GPU, "gpus": [["NVIDIA H200", 150 * 10**9], ["NVIDIA L4", 24 * 2**30]]},
+            ("CUDA, NVIDIA H200 with 140 GiB, NVIDIA L4 with 24 GiB", "ok", ""),
+        ),
+        (
+            "device",
+            {**NO_GPU, "said": "The NVIDIA driver on your system is too old"},
+            ("CPU, 2 cores", "optional", "the GPU is not used: The NVIDIA driver on your system is too old"),
+        ),
+        (
+            "video",
+            {"av": "15.1.0", "encoders": ENCODERS},
+            (
+                "av 15.1.0: libx264, no libsvtav1",
+                "optional",
+                "UnknownCodecError: libsvtav1: pip install --force-reinstall --no-deps av==15.1.0",
+            ),
+        ),
+        (
+            "simulation",
+            {"errors": {"A": "", "B": "AssertionError"}},
+            ("A, no B", "problem", "AssertionError"),
+        ),
+        ("rendering", {"backend": "osmesa"}, ("OSMesa", "ok", "")),
+    ],
+)
+def test_what_answers_mean_that_this_machine_may_not_give(
+    monkeypatch: pytest.MonkeyPatch, trial: str, answer: dict, line: tuple[str, str, str]
+) -> None:
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    made = LINES[trial](answer)
+    assert (made.name, made.value, made.status, made.remedy) == (trial, *line)
 
 
 @pytest.mark.slow

@@ -24,7 +24,6 @@ def episode(grey: int) -> dict[str, np.ndarray]:
     positions = np.random.default_rng(grey).random((6, 3), dtype=np.float32)
     return {
         "observation.state": positions,
-        "observation.environment_state": positions,
         "action": positions,
         PICTURES: pictures,
     }

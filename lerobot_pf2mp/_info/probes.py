@@ -89,7 +89,6 @@ def simulation() -> dict[str, Any]:
     """Which of the simulations that our environments are built on run; their errors by name."""
     import gymnasium
     import gymnasium_robotics
-    import mujoco  # noqa: F401
 
     gymnasium.register_envs(gymnasium_robotics)
     errors = {}

@@ -95,15 +95,17 @@ def rendering_line(answer: dict[str, Any]) -> Line:
 
 def video_line(answer: dict[str, Any]) -> Line:
     """Whether films can be written."""
-    remedy = 'pip install --force-reinstall "lerobot[evaluation]"'
     if "error" in answer:
-        return Line("video", "does not work", OPTIONAL, f"{answer['error']}: {remedy}")
+        return Line(
+            "video", "does not work", OPTIONAL, f'{answer["error"]}: pip install "lerobot[evaluation]"'
+        )
     value = f"av {answer['av']}: " + ", ".join(
         encoder if not reason else f"no {encoder}" for encoder, reason in answer["encoders"].items()
     )
     reasons = "; ".join(reason for reason in answer["encoders"].values() if reason)
     if reasons:
-        return Line("video", value, OPTIONAL, f"{reasons}: {remedy}")
+        remedy = f"{reasons}: pip install --force-reinstall --no-deps av=={answer['av']}"
+        return Line("video", value, OPTIONAL, remedy)
     return Line("video", value)
 
 
