@@ -170,7 +170,11 @@ def test_guidance_scale_zero_on_the_command_line_is_fmp(checkpoint: Path, folder
     as_fmp = folder / "as_fmp"
     shutil.copytree(checkpoint, as_fmp)
     config = json.loads((as_fmp / "config.json").read_text())
-    kept = {k: v for k, v in config.items() if not k.startswith(("guidance_", "field_", "n_field_", "on_unsupported"))}
+    kept = {
+        k: v
+        for k, v in config.items()
+        if not k.startswith(("guidance_", "field_", "n_field_", "on_unsupported"))
+    }
     (as_fmp / "config.json").write_text(json.dumps({**kept, "type": "fmp"}))
     batch = {"observation.state": torch.rand(4, 2), "observation.environment_state": torch.rand(4, 2)}
     noise = torch.randn(4, 16, 2)

@@ -15,54 +15,15 @@ from torch import Tensor
 from lerobot_pf2mp.flow_matching import Guide
 from lerobot_pf2mp.model_card import WithModelCard
 from lerobot_pf2mp.policies.dppf.configuration_dppf import DPPFConfig
-from lerobot_pf2mp.policies.guided.modeling_guided import PotentialFieldGuidance
+from lerobot_pf2mp.policies.guided.modeling_guided import GuidedPolicy
 
 
-class DPPFPolicy(WithModelCard, DiffusionPolicy):
-    """Differs from `DiffusionPolicy` by a guide in the denoising loop, and by showing the field what it learns from.
-
-    The weights are those of `DiffusionPolicy`. With ``guidance_scale=0`` nothing of its code is changed.
-
-    Args:
-        config: The policy's configuration.
-        dataset_stats: Statistics of the training dataset; None at evaluation.
-        dataset_meta: Its metadata (not used).
-    """
+class DPPFPolicy(GuidedPolicy, WithModelCard, DiffusionPolicy):
+    """Differs from `DiffusionPolicy` by a guide in the denoising loop, and by showing the field what it learns from."""
 
     config_class = DPPFConfig
     name = "dppf"
     config: DPPFConfig
-
-    def __init__(
-        self,
-        config: DPPFConfig,
-        dataset_stats: dict[str, dict[str, Any]] | None = None,
-        dataset_meta: Any = None,
-        **kwargs: Any,
-    ) -> None:
-        self._guidance = PotentialFieldGuidance(
-            config, dataset_stats
-        )  # first, as DiffusionPolicy resets itself
-        super().__init__(config)
-
-    def reset(self) -> None:
-        """Forgets past observations and planned actions; to be called when an episode begins."""
-        super().reset()
-        self._guidance.monitor.reset()
-
-    @property
-    def support(self) -> Tensor | None:
-        """``(B, T)`` how far the last chunk's actions are inside the demonstrated region [nats], negative outside.
-
-        The log density above the field's threshold; None before the first chunk and with ``on_unsupported=ignore``.
-        """
-        return self._guidance.monitor.support
-
-    def forward(self, batch: dict[str, Any]) -> tuple[Tensor, None]:
-        """The loss of `DiffusionPolicy.forward`; in training, the batch's actions also go to the potential field."""
-        if self.training and torch.is_grad_enabled():
-            self._guidance.observe(batch)
-        return super().forward(batch)
 
     @torch.no_grad()
     def predict_action_chunk(
@@ -78,15 +39,7 @@ class DPPFPolicy(WithModelCard, DiffusionPolicy):
         """
         with self._guided(guide or self.make_guide(batch)):
             chunk = super().predict_action_chunk(self._with_window(batch), noise=noise)
-        return self._guidance.check_chunk(batch, chunk)
-
-    def make_guide(self, batch: dict[str, Any]) -> Guide | None:
-        """The configured guide over the field in the batch; None with ``guidance_scale=0``.
-
-        Raises:
-            ValueError: If the batch holds no field, or one over other dimensions.
-        """
-        return self._guidance.make_guide(batch, next(self.parameters()).device)
+        return self.check_chunk(batch, chunk)
 
     def _with_window(self, batch: dict[str, Any]) -> dict[str, Any]:
         if any(self._queues.values()):

@@ -92,6 +92,64 @@ class PotentialFieldGuidance:
         return self.monitor(chunk, fitted_field(batch.get(POTENTIAL_FIELD), self.config, chunk.device))
 
 
+class GuidedPolicy:
+    """A policy guided by a potential field; to be mixed into the unguided one before its own class.
+
+    The weights are those of the unguided policy, and with ``guidance_scale=0`` so are its actions.
+
+    Args:
+        config: The policy's configuration.
+        dataset_stats: Statistics of the training dataset; None at evaluation.
+        dataset_meta: Its metadata (not used).
+    """
+
+    def __init__(
+        self,
+        config: GuidedPolicyConfig,
+        dataset_stats: dict[str, dict[str, Any]] | None = None,
+        dataset_meta: Any = None,
+        **kwargs: Any,
+    ) -> None:
+        # Before the policy's own set-up, which ends in `reset`.
+        self._guidance = PotentialFieldGuidance(config, dataset_stats)
+        super().__init__(config, **kwargs)  # type: ignore[call-arg]
+
+    def reset(self) -> None:
+        """Forgets past observations and planned actions; to be called when an episode begins."""
+        super().reset()  # type: ignore[misc]
+        self._guidance.monitor.reset()
+
+    @property
+    def support(self) -> Tensor | None:
+        """``(B, T)`` how far the last chunk's actions are inside the demonstrated region [nats], negative outside.
+
+        The log density above the field's threshold; None before the first chunk and with ``on_unsupported=ignore``.
+        """
+        return self._guidance.monitor.support
+
+    def forward(self, batch: dict[str, Any], *args: Any, **kwargs: Any) -> tuple[Tensor, None]:
+        """The loss of the unguided policy; in training, the batch's actions also go to the potential field."""
+        if self.training and torch.is_grad_enabled():  # type: ignore[attr-defined]
+            self._guidance.observe(batch)
+        return super().forward(batch, *args, **kwargs)  # type: ignore[misc]
+
+    def make_guide(self, batch: dict[str, Any]) -> Guide | None:
+        """The configured guide over the field in the batch; None with ``guidance_scale=0``.
+
+        Raises:
+            ValueError: If the batch holds no field, or one over other dimensions.
+        """
+        return self._guidance.make_guide(batch, next(self.parameters()).device)  # type: ignore[attr-defined]
+
+    def check_chunk(self, batch: dict[str, Any], chunk: Tensor) -> Tensor:
+        """The actions ``(B, T, A)`` to execute of a planned chunk, see `on_unsupported`.
+
+        Raises:
+            ValueError: If they are looked at, and the batch holds no field, or one over other dimensions.
+        """
+        return self._guidance.check_chunk(batch, chunk)
+
+
 def fitted_field(
     demonstrations: object, config: GuidedPolicyConfig, device: torch.device | str = "cpu"
 ) -> PotentialField:
