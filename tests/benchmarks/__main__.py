@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command of the benchmark suite, ``make bench``."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import sys
+import warnings
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import draccus
+from report import make_table, write_report
+from tqdm import tqdm
+
+PARTS = ("guidance", "density", "chunk", "training", "conversion", "evaluation", "startup")
+
+
+@dataclass
+class BenchConfig:
+    """Measures how fast everything is, beside what else does the same.
+
+    Examples:
+        make bench
+        python tests/benchmarks --only=[density,guidance] --output_dir=/tmp/bench
+    """
+
+    # Which parts: guidance, density, chunk, training, conversion, evaluation, startup. All of them take an hour on 2 cores.
+    only: list[str] = field(default_factory=lambda: list(PARTS))
+    # Folder of bench.csv, table.md and run.json. Parts measured there before stay, unless they are measured again.
+    output_dir: Path = Path("results/bench")
+
+
+def main() -> None:
+    """Runs the command."""
+    config = draccus.parse(BenchConfig)
+    unknown = [part for part in config.only if part not in PARTS]
+    if unknown:
+        sys.exit(f"error: only must be of {list(PARTS)}, got {unknown}")
+    logging.disable(logging.WARNING)
+    warnings.simplefilter("ignore")
+    for part in tqdm(config.only, unit="part"):
+        rows = list(importlib.import_module(part).measure())
+        write_report(config.output_dir, rows)
+        tqdm.write(make_table(rows))
+
+
+if __name__ == "__main__":
+    main()
