@@ -72,10 +72,13 @@ class ProximalGuide:
         """The guided step from the unguided one, all ``(..., D)`` [normalised]."""
         decay = math.exp(-self.scale * dt / self.field.bandwidth**2)
         a = _choose(self.point, x_t, x_next, x_1)
-        shift = (1 - decay) * self.field.mean_shift(a)
+        log_density, mean_shift = self.field.log_density_and_mean_shift(a)
+        shift = (1 - decay) * mean_shift
         guided = x_next + shift
         if self.field.alpha != 0:
-            offset = self.field.offset_to_safe_set(a + shift)
+            # A mean shift raises the density by at least this (Comaniciu and Meer 2002, Theorem 1).
+            gain = (1 - decay**2) * mean_shift.square().sum(dim=-1) / (2 * self.field.bandwidth**2)
+            offset = self.field.offset_to_safe_set(a + shift, log_density_at_least=log_density + gain)
             distance = offset.norm(dim=-1, keepdim=True)
             reach = self.scale * -self.field.alpha * dt
             guided = guided + offset * (reach / distance.clamp_min(max(reach, _TINY)))
@@ -115,7 +118,11 @@ def make_guide(
         return None
     make = EulerGuide if integrator == "euler" else ProximalGuide
     guide = make(field, scale) if point is None else make(field, scale, point)
-    return guide if action_dims is None else _OnDimensions(guide, tuple(action_dims))
+    return (
+        guide
+        if action_dims is None
+        else _OnDimensions(guide, torch.tensor(action_dims).to(field.anchors.device))
+    )
 
 
 @dataclass(frozen=True)
@@ -123,13 +130,12 @@ class _OnDimensions:
     """A guide that acts on some of the action dimensions."""
 
     guide: Guide
-    dims: tuple[int, ...]
+    dims: Tensor  # on the actions' device, as copying it there in each step would take longer than the rest
 
     def __call__(self, x_t: Tensor, x_next: Tensor, x_1: Tensor, dt: float) -> Tensor:
-        dims = torch.tensor(self.dims, device=x_next.device)
-        a_t, a_next, a_1 = (x.index_select(-1, dims) for x in (x_t, x_next, x_1))
+        a_t, a_next, a_1 = (x.index_select(-1, self.dims) for x in (x_t, x_next, x_1))
         guided = self.guide(a_t, a_next, a_1, dt)
-        return x_next.index_copy(-1, dims, guided.to(x_next.dtype))
+        return x_next.index_copy(-1, self.dims, guided.to(x_next.dtype))
 
 
 def _choose(point: str, x_t: Tensor, x_next: Tensor, x_1: Tensor) -> Tensor:

@@ -22,14 +22,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from lerobot_pf2mp.kernel_density import (
-    PAIRS_PER_BLOCK,
-    check_bandwidth,
-    log_kernels,
-    log_sum_exp,
-    mean,
-    select_bandwidth,
-)
+from lerobot_pf2mp.kernel_density import PAIRS_PER_BLOCK, check_bandwidth, log_kernels, select_bandwidth
+from lerobot_pf2mp.kernel_sums import KernelSums
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,9 +84,7 @@ class PotentialField:
         Returns:
             ``(...)`` log densities [nats], finite also far from all anchors.
         """
-        queries = self._flatten(a)
-        log_sums = [log_sum_exp(self._log_kernels(block)) for block in self._blocks(queries)]
-        return (torch.cat(log_sums) - self._log_normaliser).reshape(a.shape[:-1])
+        return self.log_density_and_mean_shift(a)[0]
 
     @torch.no_grad()
     def mean_shift(self, a: Tensor) -> Tensor:
@@ -104,14 +96,13 @@ class PotentialField:
         Returns:
             ``(..., D)`` offsets [normalised]; m(a) lies in the convex hull of the anchors.
         """
-        queries = self._flatten(a)
-        # Autocast would multiply in bfloat16.
-        with torch.autocast(device_type=queries.device.type, enabled=False):
-            shifts = [
-                torch.softmax(self._log_kernels(block), dim=-1) @ self._centred - (block - self._centre)
-                for block in self._blocks(queries)
-            ]
-        return torch.cat(shifts).reshape(a.shape)
+        return self.log_density_and_mean_shift(a)[1]
+
+    @torch.no_grad()
+    def log_density_and_mean_shift(self, a: Tensor) -> tuple[Tensor, Tensor]:
+        """`log_density` and `mean_shift` of actions ``(..., D)``, ``(...)`` and ``(..., D)``, for the price of one."""
+        shifts, log_sums = self._sums(self._flatten(a))
+        return (log_sums - self._log_normaliser).reshape(a.shape[:-1]), shifts.reshape(a.shape)
 
     def local_mean(self, a: Tensor) -> Tensor:
         """The kernel-weighted mean m(a) of the anchors, ``(..., D)`` for actions ``(..., D)`` [normalised]."""
@@ -130,7 +121,7 @@ class PotentialField:
         return self.mean_shift(a) / self.bandwidth**2
 
     @torch.no_grad()
-    def offset_to_safe_set(self, a: Tensor) -> Tensor:
+    def offset_to_safe_set(self, a: Tensor, log_density_at_least: Tensor | None = None) -> Tensor:
         """The vector from a to the safe set H; zero inside H.
 
         The paper does not say how d(a, H) is measured. Outside H this is the vector to the nearest anchor that lies
@@ -138,22 +129,27 @@ class PotentialField:
 
         Args:
             a: ``(..., D)`` actions [normalised].
+            log_density_at_least: ``(...)`` a lower bound of their log densities, where one is known; it spares looking at
+                actions that it shows to be safe.
 
         Returns:
             ``(..., D)`` offsets [normalised]; d(a, H) is their norm.
         """
         queries = self._flatten(a)
+        if queries.device.type != "cpu" or torch.compiler.is_compiling():
+            # Without a look at the values, for which a GPU would have to be waited for.
+            is_unsafe = self.log_density(queries) <= self.log_threshold
+            offsets = torch.where(is_unsafe.unsqueeze(-1), self._offset_to_safe_anchor(queries), 0.0)
+            return offsets.reshape(a.shape)
         offsets = torch.zeros_like(queries)
-        is_unsafe = self.log_density(queries) <= self.log_threshold
-        # Few actions are unsafe, least of all guided ones: only for them the nearest safe anchor is looked up.
-        unsafe = queries[is_unsafe]
+        if log_density_at_least is None:
+            unsafe = torch.arange(len(queries))
+        else:
+            unsafe = (log_density_at_least.reshape(-1) <= self.log_threshold).nonzero().squeeze(1)
         if len(unsafe):
-            safe_anchors = self._centred[self._anchor_is_safe]
-            nearest = [
-                safe_anchors[log_kernels(block - self._centre, safe_anchors, self.bandwidth).argmax(dim=-1)]
-                for block in self._blocks(unsafe)
-            ]
-            offsets[is_unsafe] = torch.cat(nearest) - (unsafe - self._centre)
+            unsafe = unsafe[self.log_density(queries[unsafe]) <= self.log_threshold]
+        if len(unsafe):
+            offsets[unsafe] = self._offset_to_safe_anchor(queries[unsafe])
         return offsets.reshape(a.shape)
 
     def potential(self, a: Tensor) -> Tensor:
@@ -186,15 +182,9 @@ class PotentialField:
             gradient = gradient - self.alpha * direction
         return gradient
 
-    # Distances are taken after centring: float32 resolves differences between actions, not their common offset.
-
     @cached_property
-    def _centre(self) -> Tensor:
-        return mean(self.anchors)  # (D,)
-
-    @cached_property
-    def _centred(self) -> Tensor:
-        return self.anchors - self._centre  # (M, D)
+    def _sums(self) -> KernelSums:
+        return KernelSums(self.anchors, self.bandwidth)
 
     @cached_property
     def _log_normaliser(self) -> float:
@@ -207,18 +197,27 @@ class PotentialField:
         # H holds at least the densest anchor, so that every action has somewhere to go.
         return (log_densities > self.log_threshold) | (log_densities == log_densities.max())
 
+    @cached_property
+    def _safe_anchors(self) -> Tensor:
+        return self.anchors[self._anchor_is_safe]
+
+    def _offset_to_safe_anchor(self, queries: Tensor) -> Tensor:
+        centre = self._safe_anchors[
+            0
+        ]  # float32 resolves differences between actions, not their common offset
+        anchors = self._safe_anchors - centre
+        nearest = [
+            anchors[log_kernels(block, anchors, self.bandwidth).argmax(dim=-1)] - block
+            for block in (queries - centre).split(max(1, PAIRS_PER_BLOCK // len(anchors)))
+        ]
+        return torch.cat(nearest)
+
     def _flatten(self, a: Tensor) -> Tensor:
         if a.ndim < 1 or a.shape[-1] != self.dim:
             raise ValueError(
                 f"the field covers {self.dim} action dimensions, got actions of shape {tuple(a.shape)}"
             )
         return a.reshape(-1, self.dim).float()  # (Q, D)
-
-    def _blocks(self, queries: Tensor) -> tuple[Tensor, ...]:
-        return queries.split(max(1, PAIRS_PER_BLOCK // self.anchors.shape[0]))
-
-    def _log_kernels(self, queries: Tensor) -> Tensor:
-        return log_kernels(queries - self._centre, self._centred, self.bandwidth)  # (Q, M)
 
 
 def fit(

@@ -433,15 +433,6 @@ def test_a_field_already_on_the_device_is_not_copied():
     assert field.to("cpu") is field
 
 
-@pytest.mark.parametrize("n_anchors", [1, 3000, 20_000, 2**20, 2**20 + 1])
-def test_no_more_than_a_million_pairs_are_held_at_once(n_anchors):
-    field = PotentialField(torch.zeros(1, 2).expand(n_anchors, 2), 1.0)
-    blocks = field._blocks(torch.zeros(2000, 2))
-    assert sum(len(block) for block in blocks) == 2000
-    for block in blocks:
-        assert len(block) * n_anchors <= 2**20 or len(block) == 1
-
-
 def test_twenty_thousand_anchors_serve_thousands_of_queries():
     anchors, a, h = torch.randn(20_000, 2), torch.randn(3000, 2), 0.1
     log_density = PotentialField(anchors, h).log_density(a)
