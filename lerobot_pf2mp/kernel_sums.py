@@ -21,11 +21,11 @@ from lerobot_pf2mp.kernel_density import PAIRS_PER_BLOCK, log_kernels, log_sum_e
 # Queries and anchors further from the origin than this (many bandwidths) count as this far, or squares would overflow.
 _FARTHEST = 5e17
 
-# Exponents |q|^2 / 2h^2 up to which float32 resolves their differences to 1e-5.
-_LARGEST_SINGLE_EXPONENT = 64.0
+# Exponents |q|^2 / 2h^2 up to which float32 resolves their differences to some 1e-5.
+_LARGEST_SINGLE_EXPONENT = 256.0
 
 # Pairs (query, anchor) from which on neighbours are looked for, and how many make a group.
-_MANY_PAIRS = 2**26
+_MANY_PAIRS = 2**25
 _ANCHORS_PER_GROUP, _QUERIES_PER_GROUP = 128, 128
 
 # The weight of all anchors that are left out for being far, relative to the nearest one's.
@@ -181,7 +181,7 @@ class _Keys:
         return self.of(self.anchors.double(), self.bandwidth)
 
     def are_resolved_in_single(self, queries: Tensor) -> bool:
-        """Whether rounding the exponents to float32 changes the weights by 1e-5 at most, relatively."""
+        """Whether rounding the exponents to float32 changes the weights by some 1e-5, relatively."""
         largest = 2 * _LARGEST_SINGLE_EXPONENT * self.bandwidth**2
         return self._largest_square <= largest and bool((queries.square().sum(dim=1) <= largest).all())
 

@@ -84,7 +84,7 @@ def test_few_and_equal_points(way, n_anchors: int, n_queries: int) -> None:
     check(way, queries[:1].expand(n_queries, 2), anchors, 0.1)
 
 
-@pytest.mark.parametrize("n_many", [0, 2**26], ids=["neighbours", "attention"])
+@pytest.mark.parametrize("n_many", [0, 2**25], ids=["neighbours", "attention"])
 @pytest.mark.parametrize("far", [1e6, 1e20, 3e38])
 def test_sums_are_finite_everywhere(far: float, n_many: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lerobot_pf2mp.kernel_sums._MANY_PAIRS", n_many)
