@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
+import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
 from lerobot_pf2mp.kernel_density import PAIRS_PER_BLOCK, log_kernels, log_sum_exp, mean
@@ -57,7 +58,7 @@ class KernelSums:
         if not len(queries):
             return queries, queries.new_empty(0)  # on which attention would crash
         with torch.autocast(device_type=queries.device.type, enabled=False):  # it would multiply in bfloat16
-            centred = queries.clamp(-_FARTHEST, _FARTHEST) - self._centre
+            centred = queries - self._centre
             if queries.device.type != "cpu":
                 return self._from_differences(centred)
             is_compiling = torch.compiler.is_compiling()
@@ -82,6 +83,7 @@ class KernelSums:
         return self._keys.attend(queries)
 
     def _among_neighbours(self, queries: Tensor) -> tuple[Tensor, Tensor]:
+        queries = queries.clamp(-_FARTHEST, _FARTHEST)
         offsets, log_sums = torch.empty_like(queries), torch.empty(len(queries))
         groups = _Groups.of(queries, _QUERIES_PER_GROUP)
         for group, near in zip(groups.members(), self._near(groups), strict=True):
@@ -192,10 +194,9 @@ class _Keys:
     def attend(self, queries: Tensor) -> tuple[Tensor, Tensor]:
         """What `KernelSums` returns, for float32 queries ``(Q, D)``."""
         precise = queries.to(self.keys.dtype)
-        scaled = (precise / self.bandwidth).clamp(-_FARTHEST, _FARTHEST)
-        ones = torch.ones_like(scaled[:, :1])
+        scaled = (precise / self.bandwidth).clamp_(-_FARTHEST, _FARTHEST)
         means, normalisers = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu(
-            torch.cat([scaled, ones], dim=1)[None, None], self.keys, self.values, scale=1.0
+            F.pad(scaled, (0, 1), value=1.0)[None, None], self.keys, self.values, scale=1.0
         )
         log_sums = normalisers[0, 0] - 0.5 * scaled.square().sum(dim=1)
         return (means[0, 0, :, :-1] - precise).float(), log_sums.float()
