@@ -1,5 +1,5 @@
 # Every target sets up .venv by itself; a second call starts at once.
-.PHONY: demo test check tables clean
+.PHONY: demo test check bench tables clean
 
 demo: .venv/installed
 	.venv/bin/pf2mp-demo --output_dir=demo
@@ -11,6 +11,9 @@ check: .venv/installed
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
+
+bench: .venv/installed
+	.venv/bin/python tests/benchmarks
 
 tables:
 	.ci/fill_tables README.md results/ABLATIONS.md

@@ -28,8 +28,8 @@ class BenchConfig:
 
     # Which parts: guidance, density, chunk, training, conversion, evaluation, startup. All of them take an hour on 2 cores.
     only: list[str] = field(default_factory=lambda: list(PARTS))
-    # Folder of bench.csv, table.md and run.json. Parts measured there before stay, unless they are measured again.
-    output_dir: Path = Path("results/bench")
+    # Folder of bench.csv, table.md and run.json; by default results/bench. Parts measured there before stay, unless they are measured again.
+    output_dir: Path = Path(__file__).parents[2] / "results" / "bench"
 
 
 def main() -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 import subprocess
 import sys
 import time
@@ -214,6 +215,8 @@ def _attention(case: Case) -> Density:
 
 
 def _pykeops(case: Case) -> Density | None:
+    if shutil.which("g++") is None:  # with which it compiles
+        return None
     try:
         from pykeops.torch import LazyTensor
     except ImportError:
