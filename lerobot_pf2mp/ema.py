@@ -3,36 +3,53 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import copy
 
 import torch
 from torch import Tensor, nn
-from torch.optim.swa_utils import AveragedModel
-
-Tensors = tuple[Tensor, ...] | list[Tensor]
 
 
-def averaged_copy(network: nn.Module, decay: float) -> AveragedModel:
-    """A frozen copy of a network whose ``update_parameters(network)`` makes it the moving average.
+class MovingAverage(nn.Module):
+    """A frozen copy of a network that becomes the moving average of its weights, and stays in evaluation mode.
 
     The count of updates is a buffer beside the averaged weights, so saving and loading the state resumes the average
-    exactly.
+    exactly. The state has the keys of PyTorch's ``AveragedModel``, whose update takes many times longer.
 
     Args:
         network: The network to follow.
-        decay: Largest decay for each update; update n uses min(decay, (1 + n) / (10 + n)).
-
-    Returns:
-        The averaged model; its ``module`` has the network's own type.
+        decay: Largest decay for each update; update n uses min(decay, (1 + n) / (10 + n)), and the first one takes the
+            weights as they are.
     """
-    average = AveragedModel(network, multi_avg_fn=_moving_average(decay))
-    return average.requires_grad_(False)
 
+    n_averaged: Tensor
 
-def _moving_average(decay: float) -> Callable[[Tensors, Tensors, Tensor | int], None]:
+    def __init__(self, network: nn.Module, decay: float) -> None:
+        super().__init__()
+        self.module = copy.deepcopy(network).requires_grad_(False).eval()
+        self.register_buffer("n_averaged", torch.tensor(0))
+        self._decay = decay
+        # Walking through the modules takes longer than averaging.
+        self._averaged: list[Tensor] = []
+        self._followed: list[Tensor] = []
+        self._has_buffers = next(network.buffers(), None) is not None
+
     @torch.no_grad()
-    def update(averaged: Tensors, current: Tensors, n_averaged: Tensor | int) -> None:
-        n = int(n_averaged)
-        torch._foreach_lerp_(averaged, current, 1 - min(decay, (1 + n) / (10 + n)))
+    def update_parameters(self, network: nn.Module) -> None:
+        """Moves the average towards the weights of the network; buffers are copied."""
+        if not self._followed or next(network.parameters()) is not self._followed[0]:
+            self._averaged = list(self.module.parameters())
+            self._followed = list(network.parameters())
+        n = int(self.n_averaged)
+        if n == 0:
+            torch._foreach_copy_(self._averaged, self._followed)
+        else:
+            decay = min(self._decay, (1 + n) / (10 + n))
+            torch._foreach_lerp_(self._averaged, self._followed, 1 - decay)
+        if self._has_buffers:
+            for buffer, followed in zip(self.module.buffers(), network.buffers(), strict=True):
+                buffer.copy_(followed)
+        self.n_averaged += 1
 
-    return update
+    def train(self, mode: bool = True) -> MovingAverage:
+        """Nothing: the average is for evaluation."""
+        return self

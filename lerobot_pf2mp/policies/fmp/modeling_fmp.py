@@ -14,7 +14,7 @@ from lerobot.policies.utils import populate_queues
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
-from lerobot_pf2mp.ema import averaged_copy
+from lerobot_pf2mp.ema import MovingAverage
 from lerobot_pf2mp.flow_matching import Guide, flow_matching_loss, integrate, sample_time
 from lerobot_pf2mp.model_card import WithModelCard
 from lerobot_pf2mp.networks import VelocityNetwork
@@ -55,7 +55,7 @@ class FMPPolicy(WithModelCard, PreTrainedPolicy):
         super().__init__(config)
         config.validate_features()
         self.network = VelocityNetwork(config)
-        self.ema = averaged_copy(self.network, config.ema_decay) if config.use_ema else None
+        self.ema = MovingAverage(self.network, config.ema_decay) if config.use_ema else None
         self.register_load_state_dict_pre_hook(_start_missing_average_at_the_weights)
         if config.compile_model:
             for network in (self.network, self.inference_network):
