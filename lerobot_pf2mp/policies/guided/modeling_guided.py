@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import hashlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from lerobot.utils.constants import ACTION
 from torch import Tensor
 
 from lerobot_pf2mp.flow_matching import Guide
+from lerobot_pf2mp.gathering import gather_rows
 from lerobot_pf2mp.guidance import make_guide
 from lerobot_pf2mp.policies.guided.support_monitor import SupportMonitor
 from lerobot_pf2mp.potential_field import PotentialField
@@ -41,15 +42,21 @@ class PotentialFieldGuidance:
         self.monitor = SupportMonitor(config.on_unsupported, config.field_action_dims)
 
     def observe(self, batch: dict[str, Any]) -> None:
-        """Shows a training batch's actions to the field that the preprocessor put into it; without one, does nothing."""
+        """Shows a training batch's actions to the field that the preprocessor put into it; without one, does nothing.
+
+        With several processes each is shown the batches of all of them: only the main one saves its field. For that they
+        exchange B x T x (4 A + 1) bytes in every step, little beside the gradients.
+        """
         demonstrations = batch.get(POTENTIAL_FIELD)
         if demonstrations is None:
             return
         self.demonstrations = demonstrations
-        frames = batch.get("index")
+        actions, is_pad, frames = gather_rows(
+            batch[ACTION], batch.get(f"{ACTION}_is_pad"), batch.get("index")
+        )
         demonstrations.observe(
-            batch[ACTION],
-            batch.get(f"{ACTION}_is_pad"),
+            cast(Tensor, actions),
+            is_pad,
             None if frames is None else frames + (1 - self.config.n_obs_steps),
             settings=self.config.field_settings,
             dataset_id=self._dataset_id,
