@@ -16,9 +16,10 @@ from lerobot_pf2mp.flow_matching import Guide
 from lerobot_pf2mp.model_card import WithModelCard
 from lerobot_pf2mp.policies.dppf.configuration_dppf import DPPFConfig
 from lerobot_pf2mp.policies.guided.modeling_guided import GuidedPolicy
+from lerobot_pf2mp.policies.without_peft import WithoutPEFT
 
 
-class DPPFPolicy(GuidedPolicy, WithModelCard, DiffusionPolicy):
+class DPPFPolicy(GuidedPolicy, WithoutPEFT, WithModelCard, DiffusionPolicy):
     """Differs from `DiffusionPolicy` by a guide in the denoising loop, and by showing the field what it learns from."""
 
     config_class = DPPFConfig

@@ -19,12 +19,13 @@ from lerobot_pf2mp.flow_matching import Guide, flow_matching_loss, integrate, sa
 from lerobot_pf2mp.model_card import WithModelCard
 from lerobot_pf2mp.networks import VelocityNetwork
 from lerobot_pf2mp.policies.fmp.configuration_fmp import FMPConfig
+from lerobot_pf2mp.policies.without_peft import WithoutPEFT
 from lerobot_pf2mp.real_time_chunking import continuing
 
 ACTION_IS_PAD = f"{ACTION}_is_pad"
 
 
-class FMPPolicy(WithModelCard, PreTrainedPolicy):
+class FMPPolicy(WithoutPEFT, WithModelCard, PreTrainedPolicy):
     """Generates chunks of actions by integrating a learned velocity field from noise.
 
     Of a chunk of `horizon` actions, counted from the oldest of `n_obs_steps` observations, the `n_action_steps` from
