@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import itertools
 import shutil
+import tracemalloc
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +11,7 @@ import h5py
 import numpy as np
 import pytest
 from lerobot.datasets import LeRobotDataset
+from lerobot_pf2mp.dataset_tools import convert_d4rl
 from lerobot_pf2mp.dataset_tools.convert_d4rl import read_d4rl
 from lerobot_pf2mp.dataset_tools.convert_minari import read_minari
 from lerobot_pf2mp.dataset_tools.episodes import Trajectory, resample
@@ -85,7 +87,7 @@ def test_d4rl_files_give_back_positions_and_goals_in_the_coordinates_of_the_envi
 ) -> None:
     expected = demonstrations(maze, 12)
     path = write_d4rl(tmp_path / "maze2d.hdf5", expected, maze, timeouts)
-    assert_same(read_d4rl(path, maze), expected, atol=1e-5)
+    assert_same(list(read_d4rl(path, maze)[1]), expected, atol=1e-5)
 
 
 def test_the_first_free_cell_of_d4rl_is_the_northwestern_one(tmp_path: Path) -> None:
@@ -100,7 +102,7 @@ def test_the_first_free_cell_of_d4rl_is_the_northwestern_one(tmp_path: Path) -> 
         observations=observations,
         infos__goal=np.tile(cells[-1], (4, 1)),
     )
-    (trajectory,) = read_d4rl(path, "large")
+    _, (trajectory,) = read_d4rl(path, "large")
     np.testing.assert_allclose(trajectory.positions, [[-4.5, 3], [-3.5, 3], [-4.5, 2], [4.5, -3]], atol=1e-6)
     np.testing.assert_allclose(trajectory.goal, [4.5, -3], atol=1e-6)
 
@@ -109,12 +111,46 @@ def test_timeouts_part_trajectories_with_one_goal_and_rounding_does_not(tmp_path
     there, back = line((-1, 1), (1, 1), 9), line((1, 1), (-1, 1), 7)
     expected = [there, Trajectory(back.positions, there.goal)]
     path = write_d4rl(tmp_path / "with.hdf5", expected, LOPSIDED, with_timeouts=True)
-    assert_same(read_d4rl(path, LOPSIDED), expected, atol=1e-5)
+    assert_same(list(read_d4rl(path, LOPSIDED)[1]), expected, atol=1e-5)
     goals = to_d4rl(np.tile(there.goal, (10, 1)), LOPSIDED) * (
         1 + np.float32(2e-7) * np.arange(10)[:, None] % 2
     )
     path = write_d4rl(tmp_path / "without.hdf5", [there], LOPSIDED, with_timeouts=False, infos__goal=goals)
-    assert_same(read_d4rl(path, LOPSIDED), [there], atol=1e-5)
+    assert_same(list(read_d4rl(path, LOPSIDED)[1]), [there], atol=1e-5)
+
+
+@pytest.mark.parametrize("timeouts", [True, False])
+@pytest.mark.parametrize("n_rows", [1, 7, 10, 64])
+def test_d4rl_files_give_back_the_same_whatever_slices_they_are_read_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, timeouts: bool, n_rows: int
+) -> None:
+    # Ways that end in the middle of a slice, with it and with the next one's first row, and ways through several.
+    lengths = [6, 2, 9, 20, 19, 1, 0, 30, 6]
+    goals = [(1.0, 1.0), (-1.0, 1.0)]
+    expected = [line((0, 1), goals[number % 2], n_steps) for number, n_steps in enumerate(lengths)]
+    path = write_d4rl(tmp_path / "maze2d.hdf5", expected, LOPSIDED, timeouts)
+    monkeypatch.setattr(convert_d4rl, "_SLICE_ROWS", n_rows)
+    n_trajectories, trajectories = read_d4rl(path, LOPSIDED)
+    assert n_trajectories == len(lengths)
+    assert_same(list(trajectories), expected, atol=1e-5)
+
+
+def test_the_memory_to_read_d4rl_files_does_not_grow_with_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(convert_d4rl, "_SLICE_ROWS", 1000)
+    there, back = line((-1, 1), (1, 1), 199), line((1, 1), (-1, 1), 199)
+
+    def peak(n_rows: int) -> int:
+        path = write_d4rl(tmp_path / "maze2d.hdf5", [there, back] * (n_rows // 400), LOPSIDED, True)
+        tracemalloc.start()
+        for _ in read_d4rl(path, LOPSIDED)[1]:
+            pass
+        used = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return used
+
+    assert peak(80_000) < 1.5 * peak(8_000)
 
 
 @pytest.mark.parametrize("timeouts", [True, False])
@@ -133,7 +169,7 @@ def test_colliding_and_short_trajectories_of_d4rl_are_left_out_and_counted(
     ]
     path = write_d4rl(tmp_path / "maze2d.hdf5", trajectories, "medium", timeouts)
     n_written, dropped = write_maze_dataset(
-        read_d4rl(path, "medium"), root=tmp_path / "d", repo_id="a/b", maze="medium", origin="", n_steps=80
+        read_d4rl(path, "medium")[1], root=tmp_path / "d", repo_id="a/b", maze="medium", origin="", n_steps=80
     )
     assert n_written == 5
     assert dropped == {"in collision": 1, "shorter than 2 steps": 2}
@@ -152,7 +188,7 @@ def test_d4rl_files_without_a_usable_trajectory_are_refused(tmp_path: Path) -> N
     path = write_d4rl(tmp_path / "maze2d.hdf5", short, LOPSIDED, with_timeouts=True)
     with pytest.raises(ValueError, match="at least one episode, got none that is usable"):
         write_maze_dataset(
-            read_d4rl(path, LOPSIDED),
+            read_d4rl(path, LOPSIDED)[1],
             root=tmp_path / "d",
             repo_id="a/b",
             maze=LOPSIDED,
@@ -172,7 +208,7 @@ def test_a_d4rl_file_may_be_given_below_the_home_folder(tmp_path: Path, monkeypa
     monkeypatch.setenv("HOME", str(tmp_path))
     expected = demonstrations("umaze", 2)
     write_d4rl(tmp_path / "maze2d.hdf5", expected, "umaze", with_timeouts=True)
-    assert_same(read_d4rl(Path("~/maze2d.hdf5"), "umaze"), expected, atol=1e-5)
+    assert_same(list(read_d4rl(Path("~/maze2d.hdf5"), "umaze")[1]), expected, atol=1e-5)
 
 
 def text(path: Path) -> None:
@@ -202,7 +238,7 @@ def test_files_that_are_not_whole_hdf5_files_are_refused(
     path = write_d4rl(tmp_path / "maze2d.hdf5", demonstrations("umaze", 4), "umaze", with_timeouts=True)
     damage(path)
     with pytest.raises(ValueError, match=r"maze2d\.hdf5 must be a whole HDF5 file"):
-        read_d4rl(path, "umaze")
+        list(read_d4rl(path, "umaze")[1])
 
 
 @pytest.mark.parametrize(
@@ -220,17 +256,24 @@ def test_files_that_are_not_whole_hdf5_files_are_refused(
         ({"timeouts": np.zeros((10, 2), bool)}, "timeouts must have one entry"),
         ({"observations": np.full((10, 4), np.nan)}, "observations must be finite, .* in row 0"),
         (
+            {"observations": np.diag(np.r_[np.zeros(9), np.nan])[:, 6:]},
+            "observations must be finite, .* in row 9",
+        ),
+        (
             {"infos__goal": np.diag(np.r_[np.zeros(9), np.inf])[:, 8:]},
             "infos/goal must be finite, .* in row 9",
         ),
     ],
 )
-def test_hdf5_files_of_another_layout_are_refused(tmp_path: Path, changes: dict, message: str) -> None:
+def test_hdf5_files_of_another_layout_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict, message: str
+) -> None:
+    monkeypatch.setattr(convert_d4rl, "_SLICE_ROWS", 4)
     path = write_d4rl(
         tmp_path / "a.hdf5", [line((-1, 1), (1, 1), 9)], LOPSIDED, with_timeouts=True, **changes
     )
     with pytest.raises(ValueError, match=message):
-        read_d4rl(path, LOPSIDED)
+        list(read_d4rl(path, LOPSIDED)[1])
 
 
 def test_hdf5_files_with_groups_or_numbers_for_columns_are_refused(tmp_path: Path) -> None:
@@ -253,7 +296,7 @@ def test_d4rl_files_recorded_in_another_maze_are_left_out_as_colliding(tmp_path:
     path = write_d4rl(tmp_path / "maze2d.hdf5", demonstrations("large", 6), "large", with_timeouts=True)
     with pytest.raises(ValueError, match="at least one episode"):
         write_maze_dataset(
-            read_d4rl(path, LOPSIDED),
+            read_d4rl(path, LOPSIDED)[1],
             root=tmp_path / "d",
             repo_id="a/b",
             maze=LOPSIDED,

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 from lerobot_pf2mp.commands.command import dataset_place, report
 from lerobot_pf2mp.commands.publishing import published_if_asked
@@ -114,11 +113,7 @@ def _convert_maze(config: ConvertConfig, path: Path) -> None:
                 f"--source.type must be {source_type} for {config.task}, got {config.source.type!r}"
             )
     maze = maze_of(config.task, config.maze_map)
-    if config.source.type == "d4rl":
-        trajectories: Any = read_d4rl(path, maze)
-        n_expected = len(trajectories)
-    else:
-        n_expected, trajectories = read_minari(path)
+    n_expected, trajectories = read_d4rl(path, maze) if config.source.type == "d4rl" else read_minari(path)
     repo_id, root = dataset_place(config.repo_id, config.root, "maze" if config.maze_map else config.task)
     n_steps = 80 if config.n_steps is None else config.n_steps
     n_written, dropped = write_maze_dataset(

@@ -89,10 +89,9 @@ class SweptBall:
         """Whether the ball touches a wall along a polyline ``(N, 2)`` of positions [m], N >= 2."""
         if not ((path >= self._border[0]) & (path <= self._border[1])).all():
             return True  # the border is wall
-        low, high = np.minimum(path[:-1], path[1:]), np.maximum(path[:-1], path[1:])  # (N - 1, 2)
-        gaps = np.maximum(self._low[:, None] - high, low - self._high[:, None]).max(
-            axis=-1
-        )  # (walls, N - 1), a lower bound of the distance to the centre's way
+        low, high = np.minimum(path[:-1], path[1:]).T, np.maximum(path[:-1], path[1:]).T  # (2, N - 1)
+        gaps = np.maximum(self._low.T[..., None] - high[:, None], low[:, None] - self._high.T[..., None])
+        gaps = np.maximum(*gaps)  # (walls, N - 1), a lower bound of the distance to the centre's way
         close = np.flatnonzero((gaps < self._radius).any(axis=0))
         return any(self.clearance(path[i], path[i + 1]) < 0 for i in close)
 
