@@ -243,15 +243,17 @@ class DemonstratedActions:
                 "demonstrated actions must be finite, got NaN or infinite values in the training batch"
             )
         if len(self):
-            ranks = torch.cat([ranks, self._ranks.to(ranks.device)])
+            known = self._ranks.to(ranks.device)
+            closest = known[torch.searchsorted(known, ranks).clamp_max(len(known) - 1)]
+            if torch.equal(closest, ranks) and len(self) <= self.settings.n_points:
+                return  # nothing new: the fitted field stands
+            ranks = torch.cat([ranks, known])
             points = torch.cat([points, self._points.to(points.device)])
         ranks, order = ranks.sort(stable=True)
         is_first = torch.ones_like(ranks, dtype=torch.bool)
         is_first[1:] = ranks[1:] != ranks[:-1]  # the hash is one to one: an equal rank is the same frame
-        ranks = ranks[is_first][: self.settings.n_points]
-        if torch.equal(ranks, self._ranks.to(ranks.device)):
-            return  # nothing new: the fitted field stands
-        self._ranks, self._points = ranks, points[order][is_first][: self.settings.n_points]
+        self._ranks = ranks[is_first][: self.settings.n_points]
+        self._points = points[order][is_first][: self.settings.n_points]
         self._fitted = None
 
 

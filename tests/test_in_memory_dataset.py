@@ -124,6 +124,18 @@ def test_a_batch_of_rows_equals_the_rows_one_by_one(root):
         assert_same(sample, in_memory[row])
 
 
+@pytest.mark.parametrize(
+    "cut", [lambda batch: batch, lambda batch: batch[1:4], list], ids=["all", "slice", "list"]
+)
+def test_a_batch_is_collated_as_its_samples_are(root, cut):
+    batch = cut(InMemoryDataset(stock(root, "everything")).__getitems__([3, 24, 3, 0, -1, 11]))
+    plain = [dict(sample) for sample in batch]
+    collated = torch.utils.data.default_collate(batch)
+    assert type(collated) is dict
+    assert len(collated["task"]) == len(plain)
+    assert_same(collated, torch.utils.data.default_collate(plain))
+
+
 def test_rows_may_be_numbers_of_other_types(root):
     in_memory = InMemoryDataset(stock(root, "actions"))
     for row in (np.int64(5), torch.tensor(5)):
