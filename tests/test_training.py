@@ -265,6 +265,7 @@ def test_streaming_and_fmp_train(folder: Path) -> None:
         "--num_workers=1",
     )
     assert distance_to_nearest(field_points(streamed), all_actions(folder / "umaze")).max() < 1e-4
+    assert load_file(streamed / FIELD_FILE)["n_shown"] == 0  # frames are told apart by their index here too
     plain = train(
         "lerobot-train",
         folder / "umaze",
