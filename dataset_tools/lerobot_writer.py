@@ -56,7 +56,8 @@ def write_dataset(
     """Writes episodes as a LeRobotDataset that LeRobot reads like one of its own.
 
     Statistics are computed and metadata laid out for many episodes in one call; frames go to parquet in whole episodes, one
-    row group each, as LeRobot's recorder leaves them. Memory does not grow with the number of episodes.
+    row group each, as LeRobot's recorder leaves them. In memory are `_BATCH_FRAMES` frames and parquet's index of the row
+    groups of one file, 14 kB an episode, until that is full.
 
     Args:
         root: The dataset's folder.
