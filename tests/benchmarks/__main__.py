@@ -14,6 +14,8 @@ import draccus
 from report import make_table, write_report
 from tqdm import tqdm
 
+from lerobot_pf2mp.plots.theme import THEMES
+
 PARTS = ("guidance", "density", "chunk", "training", "conversion", "evaluation", "startup")
 
 
@@ -26,9 +28,11 @@ class BenchConfig:
         python tests/benchmarks --only=[density,guidance] --output_dir=/tmp/bench
     """
 
-    # Which parts: guidance, density, chunk, training, conversion, evaluation, startup. All of them take an hour on 2 cores.
+    # Which parts: guidance, density, chunk, training, conversion, evaluation, startup. All of them take an hour on two
+    # cores.
     only: list[str] = field(default_factory=lambda: list(PARTS))
-    # Folder of bench.csv, table.md and run.json; by default results/bench. Parts measured there before stay, unless they are measured again.
+    # Folder of bench.csv, table.md and run.json; by default results/bench. Parts measured there before stay, unless they are
+    # measured again.
     output_dir: Path = Path(__file__).parents[2] / "results" / "bench"
 
 
@@ -42,8 +46,11 @@ def main() -> None:
     warnings.simplefilter("ignore")
     for part in tqdm(config.only, unit="part"):
         rows = list(importlib.import_module(part).measure())
-        write_report(config.output_dir, rows)
+        every = write_report(config.output_dir, rows)
         tqdm.write(make_table(rows))
+        if part == "density":
+            for background in THEMES:
+                plot_density(config.output_dir / f"density_{background}.png", every, background)
 
 
 if __name__ == "__main__":

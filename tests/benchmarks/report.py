@@ -117,5 +117,5 @@ def _cpu() -> str:
 
 def _number(value: float, unit: str) -> str:
     if unit == "x":
-        return f"{value:.3g} ×"
+        return f"{value:.3g}"
     return f"{value:,.0f} {unit}" if abs(value) >= 1000 else f"{value:.3g} {unit}"
