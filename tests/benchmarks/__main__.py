@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import draccus
+from figure import plot_density
 from report import make_table, write_report
 from tqdm import tqdm
 
