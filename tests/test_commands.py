@@ -203,6 +203,10 @@ def test_ctrl_c_and_sigterm_in_the_middle_of_collecting_leave_nothing_behind(
         (["--action_noise=nan"], "error: action_noise must be finite and at least 0, got nan"),
         (["--maze_map=11111/10000/11111"], "error: maze_map must be closed"),
         (["--maze_map=11111/10101/11111"], "error: maze_map must be connected"),
+        (
+            ["--task=handwriting_pen", "--maze_map=111/101/111"],
+            "error: --maze_map is for mazes only, got 111/101/111",
+        ),
         (["--maze_map=nowhere"], "error: maze_map must be one of ['umaze', 'medium', 'large']"),
         (["--seed=-1"], "error: seed must be at least 0, got -1"),
         (["--overwrite=perhaps"], "error: `overwrite`: Couldn't parse 'perhaps' into a bool"),

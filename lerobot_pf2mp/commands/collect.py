@@ -82,7 +82,9 @@ def _collect(config: CollectConfig) -> None:
     from lerobot_pf2mp.dataset_tools.handwriting_dataset import SPACE_OF_TASK
     from lerobot_pf2mp.dataset_tools.maze_dataset import MAZE_OF_TASK
 
-    if config.maze_map is not None or config.task in MAZE_OF_TASK:
+    if config.maze_map is not None and config.task not in MAZE_OF_TASK:
+        raise ValueError(f"--maze_map is for mazes only, got {config.maze_map} for {config.task}")
+    if config.task in MAZE_OF_TASK:
         _collect_maze(config)
     elif config.task in FETCH_OF_TASK:
         _collect_fetch(config, FETCH_OF_TASK[config.task])
