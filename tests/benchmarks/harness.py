@@ -60,7 +60,7 @@ def time_in_turns(
         For each name the time of a call in every round [s].
     """
     names = list(calls)
-    n_calls = {name: max(1, round(min_seconds / max(_seconds(calls[name], 2), 1e-9))) for name in names}
+    n_calls = {name: max(1, round(min_seconds / _warm_seconds(calls[name], min_seconds))) for name in names}
     times: dict[str, list[float]] = {name: [] for name in names}
     for round_number in range(n_rounds):
         first = round_number % len(names)
@@ -94,6 +94,12 @@ def synchronise() -> None:
     """Waits for the GPU, if there is one."""
     if torch.cuda.is_available():
         torch.cuda.synchronize()
+
+
+def _warm_seconds(call: Callable[[], object], enough: float) -> float:
+    """The time of a second call; of the first one, if it took long."""
+    first = _seconds(call, 1)
+    return first if first > 10 * enough else max(_seconds(call, 1), 1e-9)
 
 
 def _seconds(call: Callable[[], object], n_calls: int) -> float:
