@@ -4,9 +4,10 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 
-from lerobot_pf2mp.commands.command import dataset_place, report
+from lerobot_pf2mp.commands.command import write_and_report
 from lerobot_pf2mp.commands.publishing import published_if_asked
 from lerobot_pf2mp.commands.scene import SceneConfig
 from lerobot_pf2mp.commands.writing import WritingConfig
@@ -105,42 +106,32 @@ def _collect_maze(config: CollectConfig) -> None:
 
     if config.expert != "scripted":
         raise ValueError(f"expert must be scripted for a maze, got {config.expert!r}")
-    repo_id, root = dataset_place(config.repo_id, config.root, "maze" if config.maze_map else config.task)
-    n_steps = 80 if config.n_steps is None else config.n_steps
-    n_written, dropped = collect_maze(
+    write = partial(
+        collect_maze,
         maze_of(config.task, config.maze_map),
-        root=root,
-        repo_id=repo_id,
         n_episodes=4000 if config.n_episodes is None else config.n_episodes,
-        n_steps=n_steps,
         action_noise=config.action_noise,
         picture_width=_picture_width(config),
         seed=config.seed,
-        overwrite=config.overwrite,
     )
-    report(n_written, n_steps, dropped, root)
+    write_and_report(config, "maze" if config.maze_map else config.task, 80, write)
 
 
 def _collect_fetch(config: CollectConfig, task: str) -> None:
     from lerobot_pf2mp.dataset_tools.collect_fetch import collect_fetch
 
-    repo_id, root = dataset_place(config.repo_id, config.root, config.task)
-    n_steps = 48 if config.n_steps is None else config.n_steps
-    n_written, dropped = collect_fetch(
+    write = partial(
+        collect_fetch,
         task,
-        root=root,
-        repo_id=repo_id,
         n_episodes=1000 if config.n_episodes is None else config.n_episodes,
-        n_steps=n_steps,
         style=config.style,
         picture_width=_picture_width(config),
         scene_changes=asdict(config.scene),
         seed=config.seed,
         n_processes=config.n_processes,
-        overwrite=config.overwrite,
         expert=None if config.expert == "scripted" else Path(config.expert).expanduser(),
     )
-    report(n_written, n_steps, dropped, root)
+    write_and_report(config, config.task, 48, write)
 
 
 def _collect_handwriting(config: CollectConfig, space: str) -> None:
@@ -148,18 +139,13 @@ def _collect_handwriting(config: CollectConfig, space: str) -> None:
 
     if config.expert != "scripted":
         raise ValueError(f"expert must be scripted for handwriting, got {config.expert!r}")
-    repo_id, root = dataset_place(config.repo_id, config.root, config.task)
-    n_steps = HANDWRITING_STEPS if config.n_steps is None else config.n_steps
     default = {"joint": 20, "pen": 10}[space]
-    n_written, dropped = collect_handwriting(
+    write = partial(
+        collect_handwriting,
         space,
-        root=root,
-        repo_id=repo_id,
         n_episodes=default if config.n_episodes is None else config.n_episodes,
-        n_steps=n_steps,
         scene_options=config.scene_options,
         picture_width=_picture_width(config),
         seed=config.seed,
-        overwrite=config.overwrite,
     )
-    report(n_written, n_steps, dropped, root)
+    write_and_report(config, config.task, HANDWRITING_STEPS, write)

@@ -8,7 +8,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import draccus
 
@@ -56,7 +56,28 @@ def dataset_place(repo_id: str | None, root: Path | None, name: str) -> tuple[st
     return repo_id, (root or HF_LEROBOT_HOME / repo_id).expanduser()
 
 
-def report(n_episodes: int, n_steps: int, dropped: Counter[str], root: Path) -> None:
-    """Says what was written and what was left out."""
+class DatasetOptions(Protocol):
+    """The options about the dataset that a command writes."""
+
+    repo_id: str | None
+    root: Path | None
+    n_steps: int | None
+    overwrite: bool
+
+
+def write_and_report(
+    options: DatasetOptions, name: str, n_steps: int, write: Callable[..., tuple[int, Counter[str]]]
+) -> None:
+    """Writes a dataset where the options say, and says what was written and what was left out.
+
+    Args:
+        options: The command's options.
+        name: The dataset is local/NAME, where LeRobot keeps datasets, unless the options say otherwise.
+        n_steps: Steps of an episode, unless the options say otherwise.
+        write: Is given root, repo_id, n_steps and overwrite; returns the number of episodes, and by reason those left out.
+    """
+    repo_id, root = dataset_place(options.repo_id, options.root, name)
+    n_steps = n_steps if options.n_steps is None else options.n_steps
+    n_episodes, dropped = write(root=root, repo_id=repo_id, n_steps=n_steps, overwrite=options.overwrite)
     left_out = ", ".join(f"{count} {reason}" for reason, count in dropped.items()) or "none"
     print(f"Wrote {n_episodes} episodes of {n_steps} steps to {root} (left out: {left_out}).")

@@ -4,9 +4,10 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 
-from lerobot_pf2mp.commands.command import dataset_place, report
+from lerobot_pf2mp.commands.command import write_and_report
 from lerobot_pf2mp.commands.publishing import published_if_asked
 from lerobot_pf2mp.commands.scene import SceneConfig
 from lerobot_pf2mp.commands.writing import WritingConfig
@@ -91,13 +92,13 @@ def _convert(config: ConvertConfig) -> None:
         raise ValueError("--source.path must name the recording, got none")
     if source.type in ("d4rl", "minari"):
         _convert_maze(config, source.path)
-    elif source.type == "fetch":
-        _convert_fetch(config, source.path)
-    elif source.type == "handwriting":
-        _convert_handwriting(config, source.path)
-    else:
+        return
+    if source.type not in ("fetch", "handwriting"):
         types = ["d4rl", "minari", "fetch", "handwriting"]
         raise ValueError(f"--source.type must be one of {types}, got {source.type!r}")
+    if config.maze_map is not None:
+        raise ValueError(f"--maze_map is for mazes only, got {config.maze_map}")
+    (_convert_fetch if source.type == "fetch" else _convert_handwriting)(config, source.path)
 
 
 def _convert_maze(config: ConvertConfig, path: Path) -> None:
@@ -114,64 +115,45 @@ def _convert_maze(config: ConvertConfig, path: Path) -> None:
             )
     maze = maze_of(config.task, config.maze_map)
     n_expected, trajectories = read_d4rl(path, maze) if config.source.type == "d4rl" else read_minari(path)
-    repo_id, root = dataset_place(config.repo_id, config.root, "maze" if config.maze_map else config.task)
-    n_steps = 80 if config.n_steps is None else config.n_steps
-    n_written, dropped = write_maze_dataset(
+    write = partial(
+        write_maze_dataset,
         trajectories,
-        root=root,
-        repo_id=repo_id,
         maze=maze,
         origin=f"Converted from {path.name} ({config.source.type}).",
-        n_steps=n_steps,
         n_episodes=config.n_episodes,
         n_expected=n_expected,
-        overwrite=config.overwrite,
     )
-    report(n_written, n_steps, dropped, root)
+    write_and_report(config, "maze" if config.maze_map else config.task, 80, write)
 
 
 def _convert_fetch(config: ConvertConfig, path: Path) -> None:
     from lerobot_pf2mp.dataset_tools.convert_fetch import convert_fetch
     from lerobot_pf2mp.dataset_tools.fetch_dataset import FETCH_OF_TASK
 
-    if config.maze_map is not None:
-        raise ValueError(f"--maze_map is for mazes only, got {config.maze_map}")
     if config.task not in FETCH_OF_TASK:
         raise ValueError(f"task must be one of {list(FETCH_OF_TASK)}, got {config.task!r}")
-    repo_id, root = dataset_place(config.repo_id, config.root, config.task)
-    n_steps = 48 if config.n_steps is None else config.n_steps
-    n_written, dropped = convert_fetch(
+    write = partial(
+        convert_fetch,
         path,
         FETCH_OF_TASK[config.task],
-        root=root,
-        repo_id=repo_id,
-        n_steps=n_steps,
         scene_changes=asdict(config.scene),
         n_episodes=config.n_episodes,
-        overwrite=config.overwrite,
     )
-    report(n_written, n_steps, dropped, root)
+    write_and_report(config, config.task, 48, write)
 
 
 def _convert_handwriting(config: ConvertConfig, path: Path) -> None:
     from lerobot_pf2mp.dataset_tools.convert_handwriting import convert_handwriting
     from lerobot_pf2mp.dataset_tools.handwriting_dataset import SPACE_OF_TASK
 
-    if config.maze_map is not None:
-        raise ValueError(f"--maze_map is for mazes only, got {config.maze_map}")
     if config.task not in SPACE_OF_TASK:
         raise ValueError(f"task must be one of {list(SPACE_OF_TASK)}, got {config.task!r}")
-    repo_id, root = dataset_place(config.repo_id, config.root, config.task)
-    n_steps = HANDWRITING_STEPS if config.n_steps is None else config.n_steps
-    n_written, dropped = convert_handwriting(
+    write = partial(
+        convert_handwriting,
         path,
         SPACE_OF_TASK[config.task],
-        root=root,
-        repo_id=repo_id,
-        n_steps=n_steps,
         scene_options=config.scene_options,
         joint_offsets=config.source.joint_offsets,
         n_episodes=config.n_episodes,
-        overwrite=config.overwrite,
     )
-    report(n_written, n_steps, dropped, root)
+    write_and_report(config, config.task, HANDWRITING_STEPS, write)
