@@ -24,6 +24,7 @@ from torch import Tensor
 
 from lerobot_pf2mp.kernel_density import PAIRS_PER_BLOCK, check_bandwidth, log_kernels, select_bandwidth
 from lerobot_pf2mp.kernel_sums import KernelSums
+from lerobot_pf2mp.nearest import NearestPoints
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,9 +148,12 @@ class PotentialField:
         else:
             unsafe = (log_density_at_least.reshape(-1) <= self.log_threshold).nonzero().squeeze(1)
         if len(unsafe):
+            unsafe = unsafe[~self._is_in_safe_ball(queries[unsafe])]
+        if len(unsafe):
             unsafe = unsafe[self.log_density(queries[unsafe]) <= self.log_threshold]
         if len(unsafe):
-            offsets[unsafe] = self._offset_to_safe_anchor(queries[unsafe])
+            _, nearest = self._nearest_safe_anchor(queries[unsafe])
+            offsets[unsafe] = self._safe_anchors[nearest] - queries[unsafe]
         return offsets.reshape(a.shape)
 
     def potential(self, a: Tensor) -> Tensor:
@@ -200,6 +204,28 @@ class PotentialField:
     @cached_property
     def _safe_anchors(self) -> Tensor:
         return self.anchors[self._anchor_is_safe]
+
+    @cached_property
+    def _nearest_safe_anchor(self) -> NearestPoints:
+        return NearestPoints(self._safe_anchors)
+
+    @cached_property
+    def _safe_balls(self) -> tuple[NearestPoints, Tensor]:
+        """Centres and squared radii ``(K,)`` of balls that lie in the safe set.
+
+        The density is at least log p(x) + (|x - m(x)|^2 - |a - m(x)|^2) / 2h^2 at any place a (Comaniciu and Meer 2002,
+        Theorem 1), and so it is above the threshold in a ball around the local mean m(x) of an anchor x.
+        """
+        log_density, shift = self.log_density_and_mean_shift(self.anchors)
+        above = 2 * self.bandwidth**2 * (log_density - self.log_threshold)
+        squares = (shift.square().sum(dim=-1) + above).nan_to_num(posinf=math.inf)
+        return NearestPoints(self.anchors + shift), squares
+
+    def _is_in_safe_ball(self, queries: Tensor) -> Tensor:
+        """Whether each query ``(Q, D)`` is in the ball whose centre is nearest, which is found sooner than its density."""
+        nearest_centre, squared_radii = self._safe_balls
+        squares, centre = nearest_centre(queries)
+        return squares < 0.999 * squared_radii[centre]  # rounding aside
 
     def _offset_to_safe_anchor(self, queries: Tensor) -> Tensor:
         centre = self._safe_anchors[

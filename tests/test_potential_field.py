@@ -449,3 +449,33 @@ def test_the_blocks_do_not_change_the_result(monkeypatch):
     monkeypatch.setattr(kernel_density, "PAIRS_PER_BLOCK", 1000)
     result = fit(points, bandwidth=0.3, threshold_quantile=0.3, alpha=-1.0).potential_gradient(a)
     torch.testing.assert_close(result, expected, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("threshold_quantile", [0.01, 0.3])
+@pytest.mark.parametrize("dim", [1, 2, 5])
+def test_balls_that_are_said_to_be_safe_are(threshold_quantile, dim):
+    points = clusters(500, dim)
+    field = fit(points, threshold_quantile=threshold_quantile)
+    a = points.repeat(20, 1) + 2 * field.bandwidth * torch.randn(20 * len(points), dim)
+    is_in_ball = field._is_in_safe_ball(a)
+    assert (field.log_density(a[is_in_ball]) > field.log_threshold).all()
+    is_safe = field.log_density(a) > field.log_threshold
+    assert is_in_ball.sum() > 0.1 * is_safe.sum()
+
+
+def test_a_known_bound_of_the_density_changes_no_offset():
+    points = clusters(500, 2)
+    field = fit(points, threshold_quantile=0.2)
+    a = points + 3 * field.bandwidth * torch.randn_like(points)
+    bound = field.log_density(a) - torch.rand(len(a))
+    assert torch.equal(field.offset_to_safe_set(a, bound), field.offset_to_safe_set(a))
+
+
+def test_offsets_without_a_look_at_the_values_are_the_same(monkeypatch):
+    points = clusters(500, 2)
+    field = fit(points, threshold_quantile=0.2)
+    a = points + 3 * field.bandwidth * torch.randn_like(points)
+    expected = field.offset_to_safe_set(a)
+    assert (expected != 0).any()
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
+    torch.testing.assert_close(field.offset_to_safe_set(a), expected)
