@@ -2,8 +2,9 @@
 """Sums of Gaussian kernels over anchors: their logarithm, and the kernel-weighted mean of the anchors.
 
 Both come from one attention call, with queries q / h, keys x / h, biases -|x|^2 / 2h^2 and values x: its output is the
-mean, and the normaliser of its softmax is the sum, up to exp(-|q|^2 / 2h^2). Where queries and anchors are many, each
-group of neighbouring queries attends only to the anchors that are near enough to count.
+mean, and the normaliser of its softmax is the sum, up to exp(-|q|^2 / 2h^2). What is too far away to count is left out:
+the queries of a plan attend, a few at a time, to the blocks of anchors near them, all in one call; where queries and anchors
+are many, each group of neighbouring queries attends to the anchors near the group.
 """
 
 from __future__ import annotations
@@ -24,13 +25,20 @@ _FARTHEST = 5e17
 
 # Exponents |q|^2 / 2h^2 up to which float32 resolves their differences to some 1e-5.
 _LARGEST_SINGLE_EXPONENT = 256.0
+_LARGEST_BLOCK_EXPONENT = 1024.0  # of which the parts of one block differ less
 
-# Pairs (query, anchor) from which on neighbours are looked for, and how many make a group.
-_MANY_PAIRS = 2**25
+# Pairs (query, anchor) from which on blocks are worth their while, and from which on groups are; how many make one.
+_SOME_PAIRS, _MANY_PAIRS = 2**16, 2**25
+_ANCHORS_PER_BLOCK, _QUERIES_PER_BLOCK = 48, 4
 _ANCHORS_PER_GROUP, _QUERIES_PER_GROUP = 128, 128
+
+# The share of pairs that count up to which blocks are faster than all pairs, and how many blocks attend in one call.
+_SMALL_SHARE = 0.5
+_PAIRS_OF_BLOCKS_AT_ONCE = 2**13
 
 # The weight of all anchors that are left out for being far, relative to the nearest one's.
 _LEFT_OUT = 1e-7
+_NO_WEIGHT = -1e30  # as an exponent
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,10 +69,13 @@ class KernelSums:
             centred = queries - self._centre
             if queries.device.type != "cpu":
                 return self._from_differences(centred)
-            is_compiling = torch.compiler.is_compiling()
-            if is_compiling or len(queries) * len(self.anchors) < _MANY_PAIRS:
-                return self._by_attention(centred, in_double=is_compiling)
-            return self._among_neighbours(centred)
+            if torch.compiler.is_compiling():
+                return self._by_attention(centred, in_double=True)
+            n_pairs = len(queries) * len(self.anchors)
+            if n_pairs >= _MANY_PAIRS:
+                return self._among_neighbours(centred)
+            sums = self._among_blocks(centred) if n_pairs >= _SOME_PAIRS else None
+            return self._by_attention(centred, in_double=False) if sums is None else sums
 
     def _from_differences(self, queries: Tensor) -> tuple[Tensor, Tensor]:
         offsets, log_sums = torch.empty_like(queries), torch.empty_like(queries[:, 0])
@@ -82,6 +93,37 @@ class KernelSums:
             return self._double_keys.attend(queries)
         return self._keys.attend(queries)
 
+    def _among_blocks(self, queries: Tensor) -> tuple[Tensor, Tensor] | None:
+        """Small blocks of queries in the order given, in which those of a plan are neighbours; None if most pairs count."""
+        n_queries, dim = queries.shape
+        padding = -n_queries % _QUERIES_PER_BLOCK
+        padded = torch.cat([queries, queries[-1:].expand(padding, dim)]) if padding else queries
+        blocks = padded.clamp(-_FARTHEST, _FARTHEST).view(-1, _QUERIES_PER_BLOCK, dim)  # (B, q, D)
+        anchors = self._blocks
+        is_near = _are_near(blocks.amin(dim=1), blocks.amax(dim=1), anchors.groups, self._reach)
+        of_query, of_anchor = is_near.nonzero().unbind(1)  # (P,) each
+        if len(of_query) > _SMALL_SHARE * is_near.numel():
+            return None
+        parts = []
+        for q, x in zip(
+            *(pairs.split(_PAIRS_OF_BLOCKS_AT_ONCE) for pairs in (of_query, of_anchor)), strict=True
+        ):
+            # Seen from the anchors' middle all of them are close, and float32 mostly does.
+            middle = anchors.middle[x].unsqueeze(1)
+            scaled = (blocks[q] - middle).to(anchors.keys.dtype) / self.bandwidth
+            means, sums = _attend(scaled, anchors.keys[x], anchors.values[x])
+            parts.append((means.float() + middle, sums))
+        # The means of all pairs of blocks, weighted by their sums.
+        means, sums = (torch.cat(part) for part in zip(*parts, strict=True))  # (P, q, D), (P, q)
+        rows = of_query.unsqueeze(1).expand_as(sums)
+        largest = sums.new_full(blocks.shape[:2], -math.inf).scatter_reduce_(0, rows, sums, "amax")
+        weights = (sums - largest[of_query]).exp()
+        total = torch.zeros_like(largest).index_add_(0, of_query, weights)
+        shares = (weights / total[of_query]).float().unsqueeze(-1)
+        local_means = torch.zeros_like(blocks).index_add_(0, of_query, shares * means)
+        log_sums = (largest + total.log()).float()
+        return local_means.view(-1, dim)[:n_queries] - queries, log_sums.view(-1)[:n_queries]
+
     def _among_neighbours(self, queries: Tensor) -> tuple[Tensor, Tensor]:
         queries = queries.clamp(-_FARTHEST, _FARTHEST)
         offsets, log_sums = torch.empty_like(queries), torch.empty(len(queries))
@@ -97,27 +139,10 @@ class KernelSums:
         return offsets, log_sums
 
     def _near(self, queries: _Groups) -> Iterator[Tensor]:
-        """For each group of queries the groups of anchors that count, as indices in ascending order.
-
-        A group counts unless it is so far from the queries' box that its weights vanish beside those of anchors that are
-        known to be nearer to each of the queries.
-        """
-        anchors = self._groups
-        reach = 2 * self.bandwidth**2 * math.log(len(self.anchors) / _LEFT_OUT)
-        n_at_once = max(1, PAIRS_PER_BLOCK // len(anchors.low))
+        """For each group of queries the groups of anchors that count, as indices in ascending order."""
+        n_at_once = max(1, PAIRS_PER_BLOCK // len(self._groups.low))
         for low, high in zip(queries.low.split(n_at_once), queries.high.split(n_at_once), strict=True):
-            nearest = torch.zeros(len(low), len(anchors.low))  # squared distances
-            farthest = torch.zeros_like(nearest)
-            for d in range(low.shape[1]):
-                below = anchors.low[:, d] - high[:, d, None]
-                above = low[:, d, None] - anchors.high[:, d]
-                nearest += torch.maximum(below, above).clamp_min(0).square()
-                to_member = torch.maximum(
-                    (anchors.member[:, d] - low[:, d, None]).abs(),
-                    (anchors.member[:, d] - high[:, d, None]).abs(),
-                )
-                farthest += to_member.square()
-            is_near = nearest <= farthest.amin(dim=1, keepdim=True) + reach
+            is_near = _are_near(low, high, self._groups, self._reach)
             yield from (row.nonzero().squeeze(1) for row in is_near)
 
     def _anchors_of(self, groups: Tensor) -> Tensor:
@@ -127,6 +152,10 @@ class KernelSums:
         firsts = counts.cumsum(0) - counts
         rows = torch.arange(int(counts.sum())) + (starts - firsts).repeat_interleave(counts)
         return self._grouped[rows]
+
+    @cached_property
+    def _reach(self) -> float:
+        return 2 * self.bandwidth**2 * math.log(len(self.anchors) / _LEFT_OUT)
 
     # Distances are taken after centring: float32 resolves differences between points, not their common offset.
 
@@ -147,6 +176,10 @@ class KernelSums:
         return _Keys.of(self._centred.double(), self.bandwidth)
 
     @cached_property
+    def _blocks(self) -> _Blocks:
+        return _Blocks.of(self._centred, self.bandwidth)
+
+    @cached_property
     def _groups(self) -> _Groups:
         return _Groups.of(self._centred, _ANCHORS_PER_GROUP)
 
@@ -161,8 +194,8 @@ class _Keys:
 
     Args:
         anchors: ``(M, D)``.
-        keys: ``(1, 1, M, D + 1)``, x / h and the bias.
-        values: ``(1, 1, M, D + 1)``, x and a zero, as values must have the keys' size.
+        keys: ``(1, M, D + 1)``, x / h and the bias.
+        values: ``(1, M, D + 1)``, x and a zero, as values must have the keys' size.
         bandwidth: h.
     """
 
@@ -173,11 +206,8 @@ class _Keys:
 
     @classmethod
     def of(cls, anchors: Tensor, bandwidth: float) -> _Keys:
-        scaled = (anchors / bandwidth).clamp(-_FARTHEST, _FARTHEST)
-        bias = -0.5 * scaled.square().sum(dim=1, keepdim=True)
-        keys = torch.cat([scaled, bias], dim=1)
-        values = torch.cat([anchors, torch.zeros_like(bias)], dim=1)
-        return cls(anchors, keys[None, None], values[None, None], bandwidth)
+        keys, values = _keys_and_values(anchors, bandwidth)
+        return cls(anchors, keys[None], values[None], bandwidth)
 
     def double(self) -> _Keys:
         return self.of(self.anchors.double(), self.bandwidth)
@@ -195,11 +225,40 @@ class _Keys:
         """What `KernelSums` returns, for float32 queries ``(Q, D)``."""
         precise = queries.to(self.keys.dtype)
         scaled = (precise / self.bandwidth).clamp_(-_FARTHEST, _FARTHEST)
-        means, normalisers = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu(
-            F.pad(scaled, (0, 1), value=1.0)[None, None], self.keys, self.values, scale=1.0
-        )
-        log_sums = normalisers[0, 0] - 0.5 * scaled.square().sum(dim=1)
-        return (means[0, 0, :, :-1] - precise).float(), log_sums.float()
+        means, log_sums = _attend(scaled[None], self.keys, self.values)
+        return (means[0] - precise).float(), log_sums[0].float()
+
+
+@dataclass(frozen=True, eq=False)
+class _Blocks:
+    """Anchors in G groups of neighbours, all filled up to S with anchors that weigh nothing.
+
+    Args:
+        groups: The groups.
+        keys: ``(G, S, D + 1)`` x / h seen from the group's middle, and the bias; in float64 if need be.
+        values: ``(G, S, D + 1)`` x seen from there, and a zero.
+        middle: ``(G, D)`` the mean of each group.
+    """
+
+    groups: _Groups
+    keys: Tensor
+    values: Tensor
+    middle: Tensor
+
+    @classmethod
+    def of(cls, anchors: Tensor, bandwidth: float) -> _Blocks:
+        groups = _Groups.of(anchors, _ANCHORS_PER_BLOCK)
+        ends = groups.ends.unsqueeze(1)
+        starts = F.pad(ends[:-1], (0, 0, 1, 0))
+        places = starts + torch.arange(int((ends - starts).max()))  # (G, S)
+        blocks = anchors[groups.order[places.minimum(ends - 1)]]  # (G, S, D)
+        middle = blocks.mean(dim=1)
+        around = blocks - middle.unsqueeze(1)
+        largest = around.square().sum(dim=-1).max().item()
+        is_single = largest <= 2 * _LARGEST_BLOCK_EXPONENT * bandwidth**2
+        keys, values = _keys_and_values(around if is_single else around.double(), bandwidth)
+        keys[..., -1].masked_fill_(places >= ends, _NO_WEIGHT)
+        return cls(groups, keys, values, middle)
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,3 +308,35 @@ class _Groups:
         for end in self.ends.tolist():
             yield self.order[start:end]
             start = end
+
+
+def _are_near(low: Tensor, high: Tensor, anchors: _Groups, reach: float) -> Tensor:
+    """Which groups of anchors count for queries in boxes with these corners (B, D), as (B, G).
+
+    A group counts unless it is so far from the box that its weights vanish beside that of an anchor that is known to be
+    nearer to every query in it.
+    """
+    nearest = torch.zeros(len(low), len(anchors.low))  # squared distances
+    farthest = torch.zeros_like(nearest)
+    for d in range(low.shape[1]):
+        low_d, high_d = low[:, d, None], high[:, d, None]
+        gap = torch.maximum(anchors.low[:, d] - high_d, low_d - anchors.high[:, d]).clamp_min_(0)
+        member = anchors.member[:, d]
+        span = torch.maximum((member - low_d).abs_(), (member - high_d).abs_())
+        nearest.addcmul_(gap, gap)
+        farthest.addcmul_(span, span)
+    return nearest <= farthest.amin(dim=1, keepdim=True) + reach
+
+
+def _keys_and_values(anchors: Tensor, bandwidth: float) -> tuple[Tensor, Tensor]:
+    scaled = (anchors / bandwidth).clamp(-_FARTHEST, _FARTHEST)
+    bias = -0.5 * scaled.square().sum(dim=-1, keepdim=True)
+    return torch.cat([scaled, bias], dim=-1), torch.cat([anchors, torch.zeros_like(bias)], dim=-1)
+
+
+def _attend(queries: Tensor, keys: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+    """The means (B, Q, D) of the values, and the log sums of the kernels (B, Q) in float64, of queries (B, Q, D) / h."""
+    means, normalisers = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu(
+        F.pad(queries, (0, 1), value=1.0)[:, None], keys[:, None], values[:, None], scale=1.0
+    )
+    return means[:, 0, :, :-1], normalisers[:, 0] - 0.5 * queries.double().square().sum(dim=-1)
