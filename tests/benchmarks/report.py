@@ -52,7 +52,7 @@ def read_rows(path: Path) -> list[Row]:
 
 
 def write_report(folder: Path, rows: Iterable[Row]) -> list[Row]:
-    """Writes ``bench.csv``, ``table.md`` and ``run.json``; other parts that the folder holds already stay.
+    """Writes ``bench.csv``, ``table.md``, ``overview.md`` and ``run.json``; other parts that the folder holds already stay.
 
     Returns:
         All rows of the folder.
@@ -73,6 +73,8 @@ def write_report(folder: Path, rows: Iterable[Row]) -> list[Row]:
         )
     with file_written_beside(folder / "table.md") as partial:
         partial.write_text(make_table([row for row in every if row.target is not None]), encoding="utf-8")
+    with file_written_beside(folder / "overview.md") as partial:
+        partial.write_text(make_overview(every), encoding="utf-8")
     with file_written_beside(folder / "run.json") as partial:
         partial.write_text(json.dumps(made_with(), indent=2) + "\n", encoding="utf-8")
     return every
@@ -90,6 +92,25 @@ def make_table(rows: Sequence[Row]) -> str:
         lines.append(
             f"| {row.part} | {row.case}, {used} | {row.quantity} | {value} | {bound} | {row.verdict} |"
         )
+    return "\n".join(lines) + "\n"
+
+
+def make_overview(rows: Sequence[Row]) -> str:
+    """A markdown table of what is wanted: a line for each wish, with its best and worst case and how many met it."""
+    wishes: dict[tuple[str, str, float, bool], list[Row]] = {}
+    for row in rows:
+        if row.target is not None:
+            quantity = (
+                "ours / the fastest exact peer" if "fastest exact peer" in row.quantity else row.quantity
+            )
+            wishes.setdefault((row.part, quantity, row.target, row.at_least), []).append(row)
+    lines = ["| part | measured | target | best | worst | met |", "|---|---|---|---|---|---|"]
+    for (part, quantity, target, at_least), cases in wishes.items():
+        best, *_, worst = sorted(cases * 2, key=lambda row: row.value, reverse=at_least)
+        numbers = (_number(row.value, row.unit) for row in (best, worst))
+        n_met = sum(row.verdict == "met" for row in cases)
+        bound = f"{'≥' if at_least else '≤'} {_number(target, cases[0].unit)}"
+        lines.append(f"| {part} | {quantity} | {bound} | {' | '.join(numbers)} | {n_met} of {len(cases)} |")
     return "\n".join(lines) + "\n"
 
 
