@@ -371,7 +371,7 @@ def test_options_that_are_given_take_effect_and_the_others_stay(name, checkpoint
     assert torch.equal(points, field_of(fitted(name))["points"][:11, 1:])
     policy, preprocess, _ = load_policy(new, device="cpu")
     guide = policy.make_guide(preprocess({STATE: torch.zeros(1, 2), ENV: torch.zeros(1, 2)}))
-    assert (guide.dims, guide.guide.scale) == ((1,), 0.25)
+    assert (guide.dims.tolist(), guide.guide.scale) == ([1], 0.25)
     assert torch.equal(guide.guide.field.anchors, points)
     assert (guide.guide.field.bandwidth, guide.guide.field.alpha) == (0.4, -2.0)
 
