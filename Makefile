@@ -16,7 +16,7 @@ bench: .venv/installed
 	.venv/bin/python tests/benchmarks
 
 tables:
-	.ci/fill_tables README.md results/ABLATIONS.md
+	.ci/fill_tables README.md results/ABLATIONS.md results/BENCHMARKS.md
 
 clean:
 	rm -rf .venv demo build *.egg-info

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time of density and score against the number of queries, drawn from the suite's own rows."""
+"""Time of density and score against the number of anchors, drawn from the suite's own rows."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from harness import Row
 
 from lerobot_pf2mp.plots.theme import ANCHOR, EULER, GOAL, GUIDED, START, THEMES, WIDTH, themed_figure
 
-N_ANCHORS = "1e5"
+N_QUERIES = "1e4"
 _CASE = re.compile(r"D = (\d+), (\S+) anchors, (\S+) queries")
 _STYLES = {
     "ours": (GUIDED, "o"),
@@ -40,11 +40,11 @@ def plot_density(output: Path, rows: Sequence[Row], background: str = "light") -
         if (
             found
             and row.threads == 1
-            and found[2] == N_ANCHORS
+            and found[3] == N_QUERIES
             and row.quantity in _STYLES
             and row.unit == "ms"
         ):
-            lines[int(found[1])][row.quantity].append((float(found[3]), row.value))
+            lines[int(found[1])][row.quantity].append((float(found[2]), row.value))
     with themed_figure(output, theme, (WIDTH, 3.6), layout="constrained") as figure:
         axes = figure.subplots(1, len(lines), sharey=True)
         for axis, (dim, by_name) in zip(axes, sorted(lines.items()), strict=True):
@@ -53,7 +53,7 @@ def plot_density(output: Path, rows: Sequence[Row], background: str = "light") -
                 axis.plot(
                     *zip(*sorted(points), strict=True), color=colour, marker=marker, markersize=5, label=name
                 )
-            axis.set(xscale="log", yscale="log", xlabel="queries", title=f"D = {dim}", xlim=(40, 2e6))
+            axis.set(xscale="log", yscale="log", xlabel="anchors", title=f"D = {dim}", xlim=(1.5e3, 2e6))
             axis.grid(color=theme.grid, linewidth=0.6)
         axes[0].set_ylabel("one call [ms]")
         handles = {
@@ -69,4 +69,4 @@ def plot_density(output: Path, rows: Sequence[Row], background: str = "light") -
             frameon=False,
             labelcolor=theme.text,
         )
-        figure.suptitle("Log density and score at 100 000 anchors, one CPU thread", fontsize=11)
+        figure.suptitle("Log density and score of 10 000 queries, one CPU thread", fontsize=11)
