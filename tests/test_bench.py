@@ -42,7 +42,13 @@ def test_the_exponent_is_that_of_the_power_law() -> None:
 
 @pytest.mark.parametrize(
     ("target", "at_least", "verdict"),
-    [(None, False, ""), (2.0, False, "met"), (1.9, False, "missed"), (2.0, True, "met"), (2.1, True, "missed")],
+    [
+        (None, False, ""),
+        (2.0, False, "met"),
+        (1.9, False, "missed"),
+        (2.0, True, "met"),
+        (2.1, True, "missed"),
+    ],
 )
 def test_verdicts(target: float | None, at_least: bool, verdict: str) -> None:
     assert Row("p", "c", "q", 2.0, "x", target=target, at_least=at_least).verdict == verdict
