@@ -24,7 +24,7 @@ from lerobot_pf2mp.kernel_density import PAIRS_PER_BLOCK, log_kernels, log_sum_e
 _FARTHEST = 5e17
 
 # Exponents |q|^2 / 2h^2 up to which float32 resolves their differences to some 1e-5.
-_LARGEST_SINGLE_EXPONENT = 256.0
+_LARGEST_SINGLE_EXPONENT = 64.0
 _LARGEST_BLOCK_EXPONENT = 1024.0  # of which the parts of one block differ less
 
 # Pairs (query, anchor) from which on blocks are worth their while, and from which on groups are; how many make one.

@@ -61,6 +61,13 @@ def test_sums_at_demonstrated_places_are_those_of_brute_force(way, dim: int, h: 
     check(way, queries, anchors, h)
 
 
+@pytest.mark.parametrize("way", ["attention", "neighbours"])
+def test_many_anchors_around_a_query_cost_no_digits(way: str) -> None:
+    # So wide a spread, in bandwidths, that float32 alone would be wrong by more than 1e-4.
+    anchors = paths(100_000, 3, n_paths=1000)
+    check(WAYS[way], anchors[:100] + 0.08 * torch.randn(100, 3), anchors, 0.0885)
+
+
 @EVERY_WAY
 @pytest.mark.parametrize("distance", [1.0, 10.0, 1000.0])
 def test_sums_far_from_all_anchors_are_those_of_brute_force(way, distance: float) -> None:

@@ -26,7 +26,7 @@ class BenchConfig:
 
     Examples:
         make bench
-        python tests/benchmarks --only=[density,guidance] --output_dir=/tmp/bench
+        python tests/benchmarks --only=[density,guidance] --output_dir=bench
     """
 
     # Which parts: guidance, density, chunk, training, conversion, evaluation, startup. All of them take an hour on two
