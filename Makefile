@@ -21,5 +21,5 @@ tables:
 clean:
 	rm -rf .venv demo build *.egg-info
 
-.venv/installed: pyproject.toml constraints.txt
+.venv/installed: pyproject.toml constraints.txt lerobot_pf2mp/_kernel_tree.c
 	@.ci/set_up

@@ -77,11 +77,12 @@ class ProximalGuide:
         guided = x_next + shift
         if self.field.alpha != 0:
             # A mean shift raises the density by at least this (Comaniciu and Meer 2002, Theorem 1).
-            gain = (1 - decay**2) * mean_shift.square().sum(dim=-1) / (2 * self.field.bandwidth**2)
-            offset = self.field.offset_to_safe_set(a + shift, log_density_at_least=log_density + gain)
+            gain = (1 - decay**2) / (2 * self.field.bandwidth**2)
+            at_least = log_density.add(torch.linalg.vecdot(mean_shift, mean_shift), alpha=gain)
+            offset = self.field.offset_to_safe_set(a + shift, log_density_at_least=at_least)
             distance = offset.norm(dim=-1, keepdim=True)
             reach = self.scale * -self.field.alpha * dt
-            guided = guided + offset * (reach / distance.clamp_min(max(reach, _TINY)))
+            guided.addcdiv_(offset, distance.clamp_min_(max(reach, _TINY)), value=reach)
         return guided
 
 

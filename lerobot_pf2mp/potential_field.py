@@ -10,7 +10,7 @@ actions drawn at random, and a bandwidth h:
     gradient      Phi(a) = grad phi(a)                                     Eq. 11, points to safety
 
 The score grad log p is closed form, (m(a) - a) / h^2 with the local mean m(a) = softmax_i(-|a - x_i|^2 / 2h^2) x_i
-(one attention call), because LeRobot evaluates under ``torch.inference_mode()``, where autograd cannot run.
+(see `KernelSums`), because LeRobot evaluates under ``torch.inference_mode()``, where autograd cannot run.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from torch import Tensor
 
 from lerobot_pf2mp.kernel_density import PAIRS_PER_BLOCK, check_bandwidth, log_kernels, select_bandwidth
 from lerobot_pf2mp.kernel_sums import KernelSums
-from lerobot_pf2mp.nearest import NearestPoints
+from lerobot_pf2mp.kernel_tree import KernelTree
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,23 +137,16 @@ class PotentialField:
             ``(..., D)`` offsets [normalised]; d(a, H) is their norm.
         """
         queries = self._flatten(a)
-        if queries.device.type != "cpu" or torch.compiler.is_compiling():
+        if self._sums.has_tree:
+            at_least = None
+            if log_density_at_least is not None:
+                at_least = log_density_at_least.reshape(-1) + self._log_normaliser
+            log_sum = self.log_threshold + self._log_normaliser
+            offsets = self._sums.tree.offsets_to(self._safe_tree, queries, log_sum, at_least)
+        else:
             # Without a look at the values, for which a GPU would have to be waited for.
             is_unsafe = self.log_density(queries) <= self.log_threshold
             offsets = torch.where(is_unsafe.unsqueeze(-1), self._offset_to_safe_anchor(queries), 0.0)
-            return offsets.reshape(a.shape)
-        offsets = torch.zeros_like(queries)
-        if log_density_at_least is None:
-            unsafe = torch.arange(len(queries))
-        else:
-            unsafe = (log_density_at_least.reshape(-1) <= self.log_threshold).nonzero().squeeze(1)
-        if len(unsafe):
-            unsafe = unsafe[~self._is_in_safe_ball(queries[unsafe])]
-        if len(unsafe):
-            unsafe = unsafe[self.log_density(queries[unsafe]) <= self.log_threshold]
-        if len(unsafe):
-            _, nearest = self._nearest_safe_anchor(queries[unsafe])
-            offsets[unsafe] = self._safe_anchors[nearest] - queries[unsafe]
         return offsets.reshape(a.shape)
 
     def potential(self, a: Tensor) -> Tensor:
@@ -206,26 +199,8 @@ class PotentialField:
         return self.anchors[self._anchor_is_safe]
 
     @cached_property
-    def _nearest_safe_anchor(self) -> NearestPoints:
-        return NearestPoints(self._safe_anchors)
-
-    @cached_property
-    def _safe_balls(self) -> tuple[NearestPoints, Tensor]:
-        """Centres and squared radii ``(K,)`` of balls that lie in the safe set.
-
-        The density is at least log p(x) + (|x - m(x)|^2 - |a - m(x)|^2) / 2h^2 at any place a (Comaniciu and Meer 2002,
-        Theorem 1), and so it is above the threshold in a ball around the local mean m(x) of an anchor x.
-        """
-        log_density, shift = self.log_density_and_mean_shift(self.anchors)
-        above = 2 * self.bandwidth**2 * (log_density - self.log_threshold)
-        squares = (shift.square().sum(dim=-1) + above).nan_to_num(posinf=math.inf)
-        return NearestPoints(self.anchors + shift), squares
-
-    def _is_in_safe_ball(self, queries: Tensor) -> Tensor:
-        """Whether each query ``(Q, D)`` is in the ball whose centre is nearest, which is found sooner than its density."""
-        nearest_centre, squared_radii = self._safe_balls
-        squares, centre = nearest_centre(queries)
-        return squares < 0.999 * squared_radii[centre]  # rounding aside
+    def _safe_tree(self) -> KernelTree:
+        return KernelTree.of(self._safe_anchors, self.bandwidth)
 
     def _offset_to_safe_anchor(self, queries: Tensor) -> Tensor:
         centre = self._safe_anchors[

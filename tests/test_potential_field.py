@@ -5,8 +5,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from lerobot_pf2mp import kernel_density, potential_field
+from lerobot_pf2mp import kernel_density, kernel_sums, potential_field
 from lerobot_pf2mp.kernel_density import BANDWIDTH_RULES, leave_one_out_log_likelihood, select_bandwidth
+from lerobot_pf2mp.kernel_sums import KernelSums
 from lerobot_pf2mp.potential_field import PotentialField, fit
 
 # What follows is the specification in its most obvious form: all pairs at once, float64, autograd.
@@ -444,23 +445,18 @@ def test_twenty_thousand_anchors_serve_thousands_of_queries():
 
 def test_the_blocks_do_not_change_the_result(monkeypatch):
     points, a = clusters(300, 3), torch.randn(100, 3)
-    expected = fit(points, bandwidth=0.3, threshold_quantile=0.3, alpha=-1.0).potential_gradient(a)
-    monkeypatch.setattr(potential_field, "PAIRS_PER_BLOCK", 1000)
-    monkeypatch.setattr(kernel_density, "PAIRS_PER_BLOCK", 1000)
-    result = fit(points, bandwidth=0.3, threshold_quantile=0.3, alpha=-1.0).potential_gradient(a)
-    torch.testing.assert_close(result, expected, rtol=1e-5, atol=1e-5)
 
+    def results():
+        field = fit(points, bandwidth=0.3, threshold_quantile=0.3)
+        offsets, log_sums = KernelSums(points, 0.3)._from_differences(a)
+        likelihood = leave_one_out_log_likelihood(points, 0.3)
+        return offsets, log_sums, field._offset_to_safe_anchor(a), torch.tensor(likelihood)
 
-@pytest.mark.parametrize("threshold_quantile", [0.01, 0.3])
-@pytest.mark.parametrize("dim", [1, 2, 5])
-def test_balls_that_are_said_to_be_safe_are(threshold_quantile, dim):
-    points = clusters(500, dim)
-    field = fit(points, threshold_quantile=threshold_quantile)
-    a = points.repeat(20, 1) + 2 * field.bandwidth * torch.randn(20 * len(points), dim)
-    is_in_ball = field._is_in_safe_ball(a)
-    assert (field.log_density(a[is_in_ball]) > field.log_threshold).all()
-    is_safe = field.log_density(a) > field.log_threshold
-    assert is_in_ball.sum() > 0.1 * is_safe.sum()
+    expected = results()
+    for module in (potential_field, kernel_density, kernel_sums):
+        monkeypatch.setattr(module, "PAIRS_PER_BLOCK", 1000)
+    for result, wanted in zip(results(), expected, strict=True):
+        torch.testing.assert_close(result, wanted, rtol=1e-5, atol=1e-5)
 
 
 def test_a_known_bound_of_the_density_changes_no_offset():

@@ -1,0 +1,516 @@
+// SPDX-License-Identifier: Apache-2.0
+/* Sums of Gaussian kernels over many anchors, on a CPU: kernel_tree.py calls it, kernel_sums.py does without it.
+
+Anchors lie in the leaves of a k-d tree. Queries are put into groups of neighbours, and each group walks down the tree
+once, nearer child first, past whatever is too far away to count for any of its queries. A query keeps its sums relative
+to the kernel of the nearest anchor seen so far, as attention does, so that they neither overflow nor vanish. Distances
+come from differences, not from |q|^2 - 2 q.x + |x|^2, so that single precision is enough.
+*/
+
+#define Py_LIMITED_API 0x030C0000
+#define PY_SSIZE_T_CLEAN
+#include <Python.h>
+
+#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+enum {
+    LANES = 16, /* of one vector */
+    VECTORS = 4,
+    WIDTH = VECTORS * LANES, /* anchors of one leaf */
+    GROUP = 16,              /* queries that walk together */
+    MAX_DEPTH = 64,
+    LEAVES_IN_SINGLE = 64, /* that are added up in single precision before they join the totals */
+    SAMPLED = 64,          /* points that decide along which dimension a set is split */
+};
+
+typedef float Lanes __attribute__((vector_size(4 * LANES)));
+typedef float LooseLanes __attribute__((vector_size(4 * LANES), aligned(4)));
+typedef int32_t Integers __attribute__((vector_size(4 * LANES)));
+
+#define INLINE static inline __attribute__((always_inline))
+
+/* One variant for each kind of processor, the fitting one being chosen when the module is loaded. */
+#if defined(__x86_64__) && defined(__GLIBC__) && !defined(__clang__)
+#define FOR_EACH_PROCESSOR __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
+#else
+#define FOR_EACH_PROCESSOR
+#endif
+
+/* Queries further out than this count as this far; slots without an anchor are further out still. */
+static const float FARTHEST = 5e17f, LARGEST = 3e38f;
+
+typedef struct {
+    const float *leaves; /* (L, D, WIDTH) */
+    const float *boxes;  /* (2 L - 1, 2, D) corners; node k has the children 2 k + 1 and 2 k + 2, leaf i is node L - 1 + i */
+    const float *centre; /* (D,) from which leaves and boxes are seen */
+    Py_ssize_t n_leaves, dim;
+    float scale; /* log2(e) / 2h^2 */
+    float reach; /* how many powers of two below the nearest anchor's kernel others still count */
+} Tree;
+
+typedef struct {
+    Py_ssize_t size;
+    float *places;     /* (G, D) seen from the centre */
+    float *low, *high; /* (D,) corners of the box around them */
+    float *nearest;    /* (G,) squared distances to the nearest anchor seen so far */
+    float *way;        /* (G, D) offsets to it, where these are asked for */
+    Lanes *sums;       /* (G, 1 + D) of kernels, and of kernels times offsets, each relative to the nearest anchor's */
+    double *totals;    /* (G, 1 + D) of what left `sums` */
+    int *n_leaves;     /* (G,) that `sums` holds */
+} Group;
+
+/* What is asked for: the sums, or the nearest anchor alone. */
+typedef enum { SUMS, NEAREST } Aim;
+
+/* ---- Sorting points into groups of neighbours -------------------------------------------------------------------- */
+
+static Py_ssize_t widest_dimension(const float *points, Py_ssize_t dim, const int64_t *order, Py_ssize_t n) {
+    Py_ssize_t widest = 0, stride = n / SAMPLED + 1;
+    float largest = -1.0f;
+    for (Py_ssize_t d = 0; d < dim; d++) {
+        float low = INFINITY, high = -INFINITY;
+        for (Py_ssize_t i = 0; i < n; i += stride) {
+            const float x = points[order[i] * dim + d];
+            low = x < low ? x : low;
+            high = x > high ? x : high;
+        }
+        if (high - low > largest) {
+            largest = high - low;
+            widest = d;
+        }
+    }
+    return widest;
+}
+
+/* Reorders so that no key before place k is larger than one behind it (Hoare's selection). */
+static void partition_at(const float *keys, Py_ssize_t dim, int64_t *order, Py_ssize_t n, Py_ssize_t k) {
+    Py_ssize_t first = 0, last = n - 1;
+    while (first < last) {
+        const float pivot = keys[order[first + (last - first) / 2] * dim];
+        Py_ssize_t i = first, j = last;
+        while (i <= j) {
+            while (keys[order[i] * dim] < pivot) i++;
+            while (keys[order[j] * dim] > pivot) j--;
+            if (i <= j) {
+                const int64_t other = order[i];
+                order[i++] = order[j];
+                order[j--] = other;
+            }
+        }
+        if (k <= j)
+            last = j;
+        else if (k >= i)
+            first = i;
+        else
+            return;
+    }
+}
+
+/* Of n leaves of a binary tree that is full but for its last level, how many lie left of the root. */
+static Py_ssize_t left_of(Py_ssize_t n_leaves) {
+    Py_ssize_t full = 1;
+    while (2 * full <= n_leaves) full *= 2;
+    const Py_ssize_t half = full / 2 + n_leaves - full;
+    return half < full ? half : full;
+}
+
+/* Orders points so that every set of `size` successive ones, but for a smaller last one, is a leaf of such a tree. */
+static void sort(const float *points, Py_ssize_t dim, int64_t *order, Py_ssize_t n, Py_ssize_t size) {
+    while (n > size) {
+        const Py_ssize_t half = left_of((n + size - 1) / size) * size;
+        partition_at(points + widest_dimension(points, dim, order, n), dim, order, n, half);
+        sort(points, dim, order + half, n - half, size);
+        n = half;
+    }
+}
+
+/* ---- Kernels of one query and the anchors of one leaf ------------------------------------------------------------ */
+
+INLINE Lanes load(const float *place) { return *(const LooseLanes *)place; }
+
+INLINE Lanes lower(Lanes a, Lanes b) {
+    const Integers is_lower = a < b;
+    return (Lanes)((is_lower & (Integers)a) | (~is_lower & (Integers)b));
+}
+
+INLINE float lowest(Lanes a) {
+    float lanes[LANES];
+    memcpy(lanes, &a, sizeof a);
+    for (int half = LANES / 2; half; half /= 2)
+        for (int i = 0; i < half; i++) lanes[i] = lanes[i] < lanes[i + half] ? lanes[i] : lanes[i + half];
+    return lanes[0];
+}
+
+INLINE double sum(Lanes a) {
+    double total = 0.0;
+    for (int i = 0; i < LANES; i++) total += a[i];
+    return total;
+}
+
+/* 2^x for x <= 0, with a relative error of 1e-7; 0 below 2^-125. */
+INLINE Lanes power_of_two(Lanes x) {
+    const float smallest = -125.0f;
+    const Integers is_zero = x < smallest;
+    const Lanes in_range = (Lanes)((~is_zero & (Integers)x));
+    const Lanes shifted = in_range + 12582912.0f; /* 1.5 * 2^23: the last digit is worth 1 */
+    const Lanes f = in_range - (shifted - 12582912.0f);
+    /* The polynomial of least relative error for 2^f in [-1/2, 1/2]. */
+    Lanes p = 0.001327647129073739f * f + 0.009675540961325169f;
+    p = p * f + 0.05550713092088699f;
+    p = p * f + 0.24022120237350464f;
+    p = p * f + 0.6931469440460205f;
+    p = p * f + 1.0000001192092896f;
+    const Integers power = (Integers)p + ((Integers)shifted << 23);
+    return (Lanes)(~is_zero & power);
+}
+
+INLINE void move_to_totals(Group *group, Py_ssize_t i, Py_ssize_t dim) {
+    const Lanes zero = {0};
+    for (Py_ssize_t d = 0; d <= dim; d++) {
+        group->totals[i * (1 + dim) + d] += sum(group->sums[i * (1 + dim) + d]);
+        group->sums[i * (1 + dim) + d] = zero;
+    }
+    group->n_leaves[i] = 0;
+}
+
+INLINE void distances(const float *leaf, const float *q, const Py_ssize_t dim, Lanes squares[VECTORS]) {
+    for (int v = 0; v < VECTORS; v++) squares[v] = (Lanes){0};
+    for (Py_ssize_t d = 0; d < dim; d++)
+        for (int v = 0; v < VECTORS; v++) {
+            const Lanes offset = load(leaf + d * WIDTH + v * LANES) - q[d];
+            squares[v] += offset * offset;
+        }
+}
+
+INLINE void add_kernels(
+    const Tree *tree, const float *leaf, Group *group, Py_ssize_t i, const Lanes squares[VECTORS], const Py_ssize_t dim
+) {
+    const float *q = group->places + i * dim;
+    Lanes *sums = group->sums + i * (1 + dim);
+    Lanes weights[VECTORS];
+    for (int v = 0; v < VECTORS; v++) {
+        weights[v] = power_of_two(tree->scale * (group->nearest[i] - squares[v]));
+        sums[0] += weights[v];
+    }
+    for (Py_ssize_t d = 0; d < dim; d++) {
+        Lanes shift = sums[1 + d];
+        for (int v = 0; v < VECTORS; v++) shift += weights[v] * (load(leaf + d * WIDTH + v * LANES) - q[d]);
+        sums[1 + d] = shift;
+    }
+    if (++group->n_leaves[i] == LEAVES_IN_SINGLE) move_to_totals(group, i, dim);
+}
+
+INLINE void shrink(Group *group, Py_ssize_t i, float factor, const Py_ssize_t dim) {
+    for (Py_ssize_t d = i * (1 + dim); d < (i + 1) * (1 + dim); d++) {
+        group->sums[d] *= factor;
+        group->totals[d] *= factor;
+    }
+}
+
+/* Notes the way to the anchor of a leaf that is this far away. */
+INLINE void go_to(const float *leaf, Group *group, Py_ssize_t i, const Lanes squares[VECTORS], const Py_ssize_t dim) {
+    float flat[WIDTH];
+    memcpy(flat, squares, sizeof flat);
+    int slot = 0;
+    while (slot < WIDTH - 1 && flat[slot] != group->nearest[i]) slot++;
+    for (Py_ssize_t d = 0; d < dim; d++) group->way[i * dim + d] = leaf[d * WIDTH + slot] - group->places[i * dim + d];
+}
+
+INLINE void visit_leaf(const Tree *tree, const float *leaf, Group *group, Py_ssize_t i, const Py_ssize_t dim, const Aim aim) {
+    Lanes squares[VECTORS];
+    distances(leaf, group->places + i * dim, dim, squares);
+    Lanes least = squares[0];
+    for (int v = 1; v < VECTORS; v++) least = lower(least, squares[v]);
+    const float nearest = lowest(least), before = group->nearest[i];
+    if (nearest < before) {
+        group->nearest[i] = nearest;
+        if (aim == NEAREST)
+            go_to(leaf, group, i, squares, dim);
+        else
+            shrink(group, i, exp2f(tree->scale * (nearest - before)), dim);
+    }
+    if (aim == SUMS && !(tree->scale * (nearest - before) > tree->reach)) add_kernels(tree, leaf, group, i, squares, dim);
+}
+
+/* ---- Walking down the tree --------------------------------------------------------------------------------------- */
+
+/* The squared distance between two boxes. */
+INLINE float gap(const float *low, const float *high, const float *box, const Py_ssize_t dim) {
+    float square = 0.0f;
+    for (Py_ssize_t d = 0; d < dim; d++) {
+        const float below = box[d] - high[d], above = low[d] - box[dim + d];
+        const float distance = below > above ? below : above;
+        square += distance > 0.0f ? distance * distance : 0.0f;
+    }
+    return square;
+}
+
+INLINE void walk(const Tree *tree, Group *group, const Py_ssize_t dim, const Aim aim) {
+    const float reach = aim == SUMS ? tree->reach : 0.0f;
+    struct {
+        Py_ssize_t node;
+        float square;
+    } todo[MAX_DEPTH] = {{0, 0.0f}};
+    float farthest = INFINITY; /* of the queries' nearest anchors */
+    for (int n_todo = 1; n_todo;) {
+        const Py_ssize_t node = todo[--n_todo].node;
+        if (tree->scale * (todo[n_todo].square - farthest) > reach) continue;
+        if (node < tree->n_leaves - 1) {
+            Py_ssize_t near = 2 * node + 1, far = near + 1;
+            float near_square = gap(group->low, group->high, tree->boxes + near * 2 * dim, dim);
+            float far_square = gap(group->low, group->high, tree->boxes + far * 2 * dim, dim);
+            if (far_square < near_square) {
+                const float square = near_square;
+                near_square = far_square, far_square = square;
+                near = far, far = 2 * node + 1;
+            }
+            todo[n_todo].node = far, todo[n_todo++].square = far_square;
+            todo[n_todo].node = near, todo[n_todo++].square = near_square;
+            continue;
+        }
+        const float *leaf = tree->leaves + (node - (tree->n_leaves - 1)) * dim * WIDTH;
+        const float *box = tree->boxes + node * 2 * dim;
+        farthest = 0.0f;
+        for (Py_ssize_t i = 0; i < group->size; i++) {
+            const float *q = group->places + i * dim;
+            if (!(tree->scale * (gap(q, q, box, dim) - group->nearest[i]) > reach))
+                visit_leaf(tree, leaf, group, i, dim, aim);
+            farthest = group->nearest[i] > farthest ? group->nearest[i] : farthest;
+        }
+    }
+}
+
+FOR_EACH_PROCESSOR static void sum_up(const Tree *tree, Group *group) {
+    switch (tree->dim) { /* loops of a known length are unrolled */
+    case 1: walk(tree, group, 1, SUMS); break;
+    case 2: walk(tree, group, 2, SUMS); break;
+    case 3: walk(tree, group, 3, SUMS); break;
+    case 4: walk(tree, group, 4, SUMS); break;
+    default: walk(tree, group, tree->dim, SUMS);
+    }
+}
+
+FOR_EACH_PROCESSOR static void look_around(const Tree *tree, Group *group) { walk(tree, group, tree->dim, NEAREST); }
+
+/* ---- Groups of queries ------------------------------------------------------------------------------------------- */
+
+static void gather(Group *group, const Tree *tree, const float *queries, const int64_t *order, Py_ssize_t size) {
+    const Py_ssize_t dim = tree->dim;
+    group->size = size;
+    for (Py_ssize_t d = 0; d < dim; d++) group->low[d] = INFINITY, group->high[d] = -INFINITY;
+    for (Py_ssize_t i = 0; i < size; i++) {
+        for (Py_ssize_t d = 0; d < dim; d++) {
+            const float x = queries[order[i] * dim + d] - tree->centre[d];
+            const float place = x < -FARTHEST ? -FARTHEST : x > FARTHEST ? FARTHEST : x;
+            group->places[i * dim + d] = place;
+            group->low[d] = place < group->low[d] ? place : group->low[d];
+            group->high[d] = place > group->high[d] ? place : group->high[d];
+        }
+        group->nearest[i] = INFINITY;
+        group->n_leaves[i] = 0;
+    }
+    memset(group->way, 0, size * dim * sizeof *group->way);
+    memset(group->sums, 0, size * (1 + dim) * sizeof *group->sums);
+    memset(group->totals, 0, size * (1 + dim) * sizeof *group->totals);
+}
+
+static void scatter_sums(Group *group, const Tree *tree, const int64_t *order, float *offsets, float *log_sums) {
+    const Py_ssize_t dim = tree->dim;
+    for (Py_ssize_t i = 0; i < group->size; i++) {
+        move_to_totals(group, i, dim);
+        const double *totals = group->totals + i * (1 + dim);
+        const double log_sum = log(totals[0]) - M_LN2 * tree->scale * (double)group->nearest[i];
+        log_sums[order[i]] = log_sum < -LARGEST ? -LARGEST : (float)log_sum;
+        if (!offsets) continue;
+        for (Py_ssize_t d = 0; d < dim; d++) offsets[order[i] * dim + d] = (float)(totals[1 + d] / totals[0]);
+    }
+}
+
+static void scatter_way(const Group *group, Py_ssize_t dim, const int64_t *order, float *offsets) {
+    for (Py_ssize_t i = 0; i < group->size; i++)
+        memcpy(offsets + order[i] * dim, group->way + i * dim, dim * sizeof *offsets);
+}
+
+/* For n of the queries, in an order that changes: either offsets, if wanted, and log sums, or offsets to the nearest anchor
+   where `log_sums` is NULL. False without memory. */
+static int visit(
+    const Tree *tree, const float *queries, int64_t *order, Py_ssize_t n, float *offsets, float *log_sums
+) {
+    const Py_ssize_t dim = tree->dim, row = GROUP * (1 + dim);
+    Lanes *sums = aligned_alloc(sizeof(Lanes), row * sizeof(Lanes));
+    double *totals = malloc(row * sizeof *totals);
+    float *floats = malloc((2 * GROUP * dim + 2 * dim + GROUP) * sizeof *floats);
+    int n_in_sums[GROUP];
+    const int has_memory = sums && totals && floats;
+    if (has_memory) {
+        Group group = {.sums = sums, .totals = totals, .n_leaves = n_in_sums, .places = floats};
+        group.way = group.places + GROUP * dim;
+        group.low = group.way + GROUP * dim;
+        group.high = group.low + dim;
+        group.nearest = group.high + dim;
+        sort(queries, dim, order, n, GROUP);
+        for (Py_ssize_t i = 0; i < n; i += GROUP) {
+            gather(&group, tree, queries, order + i, n - i < GROUP ? n - i : GROUP);
+            if (log_sums) {
+                sum_up(tree, &group);
+                scatter_sums(&group, tree, order + i, offsets, log_sums);
+            } else {
+                look_around(tree, &group);
+                scatter_way(&group, dim, order + i, offsets);
+            }
+        }
+    }
+    free(sums), free(totals), free(floats);
+    return has_memory;
+}
+
+static int sum_all(const Tree *tree, const float *queries, Py_ssize_t n, float *offsets, float *log_sums) {
+    int64_t *order = malloc((n + 1) * sizeof *order);
+    if (!order) return 0;
+    for (Py_ssize_t i = 0; i < n; i++) order[i] = i;
+    const int has_memory = visit(tree, queries, order, n, offsets, log_sums);
+    free(order);
+    return has_memory;
+}
+
+/* Keeps those of n indices whose value is not above the threshold, and says how many these are. */
+static Py_ssize_t keep_low(int64_t *order, Py_ssize_t n, const float *values, float threshold) {
+    Py_ssize_t n_kept = 0;
+    for (Py_ssize_t i = 0; i < n; i++)
+        if (!(values[order[i]] > threshold)) order[n_kept++] = order[i];
+    return n_kept;
+}
+
+/* The way to the nearest target for queries whose log sum is not above the threshold; known lower bounds, or NULL. */
+static int lead_all_to_targets(
+    const Tree *tree, const Tree *targets, const float *queries, Py_ssize_t n, const float *at_least, float threshold,
+    float *offsets
+) {
+    int64_t *order = malloc((n + 1) * sizeof *order);
+    float *log_sums = malloc((n + 1) * sizeof *log_sums);
+    int has_memory = order && log_sums;
+    if (has_memory) {
+        for (Py_ssize_t i = 0; i < n; i++) order[i] = i;
+        if (at_least) n = keep_low(order, n, at_least, threshold);
+        has_memory = visit(tree, queries, order, n, NULL, log_sums);
+        n = keep_low(order, n, log_sums, threshold);
+        has_memory = has_memory && visit(targets, queries, order, n, offsets, NULL);
+    }
+    free(order), free(log_sums);
+    return has_memory;
+}
+
+/* ---- For Python -------------------------------------------------------------------------------------------------- */
+
+/* A tree as Python holds it: (leaves, boxes, centre, scale, reach). */
+typedef struct {
+    Py_buffer leaves, boxes, centre;
+    float scale, reach;
+} HeldTree;
+
+#define HELD_TREE "(y*y*y*ff)"
+#define POINTERS_TO(held) &(held).leaves, &(held).boxes, &(held).centre, &(held).scale, &(held).reach
+
+static void release(HeldTree *held) {
+    PyBuffer_Release(&held->leaves), PyBuffer_Release(&held->boxes), PyBuffer_Release(&held->centre);
+}
+
+static Py_ssize_t n_floats(const Py_buffer *buffer) { return buffer->len / sizeof(float); }
+
+/* False if the sizes do not fit. */
+static int read_tree(const HeldTree *held, Tree *tree) {
+    const Py_ssize_t dim = n_floats(&held->centre), n_nodes = dim ? n_floats(&held->boxes) / (2 * dim) : 0;
+    *tree = (Tree){
+        .leaves = held->leaves.buf, .boxes = held->boxes.buf, .centre = held->centre.buf,
+        .n_leaves = (n_nodes + 1) / 2, .dim = dim, .scale = held->scale, .reach = held->reach,
+    };
+    return n_nodes % 2 && n_floats(&held->boxes) == n_nodes * 2 * dim
+        && n_floats(&held->leaves) == tree->n_leaves * dim * WIDTH;
+}
+
+static PyObject *answer(int fits, int has_memory) {
+    if (!fits) {
+        PyErr_SetString(PyExc_ValueError, "the arrays' sizes do not fit");
+        return NULL;
+    }
+    if (!has_memory) return PyErr_NoMemory();
+    Py_RETURN_NONE;
+}
+
+static PyObject *order_points(PyObject *module, PyObject *args) {
+    Py_buffer points, order;
+    if (!PyArg_ParseTuple(args, "y*w*", &points, &order)) return NULL;
+    const Py_ssize_t n = order.len / sizeof(int64_t);
+    const int fits = n > 0 && n_floats(&points) > 0 && n_floats(&points) % n == 0;
+    if (fits) {
+        Py_BEGIN_ALLOW_THREADS;
+        int64_t *indices = order.buf;
+        for (Py_ssize_t i = 0; i < n; i++) indices[i] = i;
+        sort(points.buf, n_floats(&points) / n, indices, n, WIDTH);
+        Py_END_ALLOW_THREADS;
+    }
+    PyBuffer_Release(&points), PyBuffer_Release(&order);
+    return answer(fits, 1);
+}
+
+static PyObject *sum_kernels(PyObject *module, PyObject *args) {
+    HeldTree held;
+    Py_buffer queries, offsets, log_sums;
+    Tree tree;
+    if (!PyArg_ParseTuple(args, HELD_TREE "y*w*w*", POINTERS_TO(held), &queries, &offsets, &log_sums)) return NULL;
+    const Py_ssize_t n = n_floats(&log_sums);
+    const int fits = read_tree(&held, &tree) && n_floats(&queries) == n * tree.dim && offsets.len == queries.len;
+    int has_memory = 1;
+    if (fits) {
+        Py_BEGIN_ALLOW_THREADS;
+        has_memory = sum_all(&tree, queries.buf, n, offsets.buf, log_sums.buf);
+        Py_END_ALLOW_THREADS;
+    }
+    release(&held), PyBuffer_Release(&queries), PyBuffer_Release(&offsets), PyBuffer_Release(&log_sums);
+    return answer(fits, has_memory);
+}
+
+static PyObject *lead_to_targets(PyObject *module, PyObject *args) {
+    HeldTree held, held_targets;
+    Py_buffer queries, at_least, offsets;
+    float threshold;
+    Tree tree, targets;
+    if (!PyArg_ParseTuple(
+            args, HELD_TREE HELD_TREE "y*z*fw*", POINTERS_TO(held), POINTERS_TO(held_targets), &queries, &at_least,
+            &threshold, &offsets
+        ))
+        return NULL;
+    const int fits = read_tree(&held, &tree) && read_tree(&held_targets, &targets) && tree.dim == targets.dim
+        && n_floats(&queries) % tree.dim == 0 && offsets.len == queries.len
+        && (!at_least.buf || n_floats(&at_least) * tree.dim == n_floats(&queries));
+    int has_memory = 1;
+    if (fits) {
+        Py_BEGIN_ALLOW_THREADS;
+        const Py_ssize_t n = n_floats(&queries) / tree.dim;
+        has_memory = lead_all_to_targets(&tree, &targets, queries.buf, n, at_least.buf, threshold, offsets.buf);
+        Py_END_ALLOW_THREADS;
+    }
+    release(&held), release(&held_targets);
+    PyBuffer_Release(&queries), PyBuffer_Release(&at_least), PyBuffer_Release(&offsets);
+    return answer(fits, has_memory);
+}
+
+static PyMethodDef methods[] = {
+    {"order_points", order_points, METH_VARARGS, "Sorts points into leaves."},
+    {"sum_kernels", sum_kernels, METH_VARARGS, "The offsets to local means, and the logarithms of the sums."},
+    {"lead_to_targets", lead_to_targets, METH_VARARGS, "The offsets from where few anchors are to the nearest target."},
+    {NULL, NULL, 0, NULL},
+};
+
+static struct PyModuleDef module = {
+    PyModuleDef_HEAD_INIT, "_kernel_tree", "Sums of Gaussian kernels on a CPU.", -1, methods, NULL, NULL, NULL, NULL,
+};
+
+PyMODINIT_FUNC PyInit__kernel_tree(void) {
+    PyObject *created = PyModule_Create(&module);
+    if (created && PyModule_AddIntConstant(created, "LEAF_SIZE", WIDTH) < 0) Py_CLEAR(created);
+    return created;
+}

@@ -1,0 +1,25 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The C extension. All arrays are float32 and contiguous unless said otherwise; it holds no lock while it works.
+
+A tree is what `KernelTree` holds: (leaves, boxes, centre, scale, reach). Sizes that do not fit raise a ValueError.
+"""
+
+from numpy.typing import NDArray
+
+type Tree = tuple[NDArray, NDArray, NDArray, float, float]
+
+LEAF_SIZE: int
+
+def order_points(points: NDArray, order: NDArray) -> None:
+    """Fills `order` ``(N,)`` int64 so that every LEAF_SIZE successive points ``(N, D)`` are a leaf's."""
+
+def sum_kernels(tree: Tree, queries: NDArray, offsets: NDArray, log_sums: NDArray) -> None:
+    """Fills `offsets` ``(Q, D)`` to the local means and `log_sums` ``(Q,)`` of the kernels at queries ``(Q, D)``."""
+
+def lead_to_targets(
+    tree: Tree, targets: Tree, queries: NDArray, at_least: NDArray | None, threshold: float, offsets: NDArray
+) -> None:
+    """Fills `offsets` ``(Q, D)``, to the nearest target, of queries whose log sum is not above the threshold.
+
+    Those of the others stay as they are. `at_least` ``(Q,)`` are lower bounds of the log sums, where known.
+    """

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sums of Gaussian kernels over a k-d tree of anchors, on a CPU: what `KernelSums` returns, by a small C extension.
+
+It leaves out the anchors that are too far away to count. Where it could not be built, `is_available` is false.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lerobot_pf2mp.kernel_density import mean
+
+try:
+    from lerobot_pf2mp import _kernel_tree
+except ImportError:  # installed without a C compiler
+    _kernel_tree = None  # type: ignore[assignment]
+
+# The weight of all anchors that are left out for being far, relative to the nearest one's.
+_LEFT_OUT = 1e-7
+
+# Anchors further from the origin than this count as this far; the missing ones of a leaf that is not full are further.
+_FARTHEST, _MISSING = 5e17, 1e19
+_LARGEST_SCALE = 1e30
+
+# Queries that are worth a thread of their own.
+_QUERIES_PER_THREAD = 512
+
+
+def is_available() -> bool:
+    """Whether the C extension could be built."""
+    return _kernel_tree is not None
+
+
+@dataclass(frozen=True, eq=False)
+class KernelTree:
+    """A binary tree of L leaves, full but for its last level: leaf i is node L - 1 + i, node k has children 2k + 1, 2k + 2.
+
+    Args:
+        leaves: ``(L, D, S)`` the anchors of each leaf, seen from the centre.
+        boxes: ``(2 L - 1, 2, D)`` the lower and the upper corner of the box around each node's anchors, seen from there.
+        centre: ``(D,)``. Float32 resolves differences between points, not their common offset.
+        scale: What turns squared distances into exponents of 2.
+        reach: How many powers of 2 below the nearest anchor's kernel others still count.
+    """
+
+    leaves: Tensor
+    boxes: Tensor
+    centre: Tensor
+    scale: float
+    reach: float
+
+    @classmethod
+    def of(cls, anchors: Tensor, bandwidth: float) -> KernelTree:
+        """The tree of anchors ``(M, D)``, float32 on the CPU, M >= 1."""
+        n_anchors, dim = anchors.shape
+        size = _kernel_tree.LEAF_SIZE
+        centre = mean(anchors)
+        order = torch.empty(n_anchors, dtype=torch.int64)
+        _kernel_tree.order_points(anchors.contiguous().numpy(), order.numpy())
+        places = torch.full((-(-n_anchors // size) * size, dim), _MISSING)
+        places[:n_anchors] = (anchors - centre)[order].clamp(-_FARTHEST, _FARTHEST)
+        leaves = places.view(-1, size, dim)
+        # From left to right the leaves of the last level come first, but they have the last numbers.
+        full_level = 2 ** (len(leaves).bit_length() - 1)
+        leaves = leaves.roll(-2 * (len(leaves) - full_level), dims=0)
+        return cls(
+            leaves.transpose(1, 2).contiguous(),
+            _boxes_around(leaves),
+            centre,
+            scale=min(math.log2(math.e) / (2 * bandwidth**2), _LARGEST_SCALE),
+            reach=math.log2(n_anchors / _LEFT_OUT),
+        )
+
+    def sums(self, queries: Tensor) -> tuple[Tensor, Tensor]:
+        """The offsets ``(Q, D)`` to the local means and the log sums ``(Q,)`` at float32 queries ``(Q, D)``."""
+        queries = queries.contiguous()
+        offsets, log_sums = torch.empty_like(queries), torch.empty(len(queries))
+        _in_threads(
+            lambda q, m, s: _kernel_tree.sum_kernels(self._held, q, m, s),
+            [queries.numpy(), offsets.numpy(), log_sums.numpy()],
+        )
+        return offsets, log_sums
+
+    def offsets_to(
+        self, targets: KernelTree, queries: Tensor, log_sum: float, log_sums_at_least: Tensor | None = None
+    ) -> Tensor:
+        """The way from where the kernels add up to little.
+
+        Args:
+            targets: Where to.
+            queries: ``(Q, D)`` float32.
+            log_sum: What counts as little.
+            log_sums_at_least: ``(Q,)`` lower bounds of the log sums, where known; they spare looking at those above.
+
+        Returns:
+            ``(Q, D)`` offsets to the nearest target; zero where the log sum is above `log_sum`.
+        """
+        queries = queries.contiguous()
+        offsets = torch.zeros_like(queries)
+        arrays = [queries.numpy(), offsets.numpy()]
+        if log_sums_at_least is not None:
+            arrays.append(log_sums_at_least.contiguous().numpy())
+        _in_threads(
+            lambda q, out, at_least=None: _kernel_tree.lead_to_targets(
+                self._held, targets._held, q, at_least, log_sum, out
+            ),
+            arrays,
+        )
+        return offsets
+
+    @cached_property
+    def _held(self) -> tuple[NDArray, NDArray, NDArray, float, float]:
+        return self.leaves.numpy(), self.boxes.numpy(), self.centre.numpy(), self.scale, self.reach
+
+
+def _in_threads(fill: Callable[..., None], arrays: list[NDArray]) -> None:
+    """Calls `fill` with arrays ``(Q, ...)``, or with slices of them in several threads."""
+    n_threads = min(torch.get_num_threads(), 1 + len(arrays[0]) // _QUERIES_PER_THREAD)
+    if n_threads == 1:
+        fill(*arrays)
+        return
+    with ThreadPoolExecutor(n_threads) as pool:
+        list(pool.map(fill, *(np.array_split(array, n_threads) for array in arrays)))
+
+
+def _boxes_around(leaves: Tensor) -> Tensor:
+    """The boxes ``(2 L - 1, 2, D)`` of all nodes above leaves ``(L, S, D)``, and of these."""
+    n_leaves, _, dim = leaves.shape
+    boxes = torch.empty(2 * n_leaves - 1, 2, dim)
+    boxes[n_leaves - 1 :, 0] = leaves.amin(dim=1)
+    boxes[n_leaves - 1 :, 1] = leaves.masked_fill(leaves == _MISSING, -_MISSING).amax(dim=1)
+    end = n_leaves - 1  # from here on boxes are known
+    while end > 0:
+        start = end // 2
+        children = boxes[2 * start + 1 : 2 * end + 1].view(-1, 2, 2, dim)
+        boxes[start:end, 0] = children[:, :, 0].amin(dim=1)
+        boxes[start:end, 1] = children[:, :, 1].amax(dim=1)
+        end = start
+    return boxes
