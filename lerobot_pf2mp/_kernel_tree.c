@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/* Sums of Gaussian kernels over many anchors, on a CPU: kernel_tree.py calls it, kernel_sums.py does without it.
+/* Sums of Gaussian kernels over many anchors, on a CPU. kernel_tree.py calls this, kernel_sums.py can do without.
 
 Anchors lie in the leaves of a k-d tree. Queries are put into groups of neighbours, and each group walks down the tree
 once, nearer child first, past whatever is too far away to count for any of its queries. A query keeps its sums relative
@@ -7,10 +7,12 @@ to the kernel of the nearest anchor seen so far, as attention does, so that they
 come from differences, not from |q|^2 - 2 q.x + |x|^2, so that single precision is enough.
 */
 
+#define _GNU_SOURCE /* RTLD_DEFAULT */
 #define Py_LIMITED_API 0x030C0000
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
 
+#include <dlfcn.h>
 #include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
@@ -24,6 +26,8 @@ enum {
     MAX_DEPTH = 64,
     LEAVES_IN_SINGLE = 64, /* that are added up in single precision before they join the totals */
     SAMPLED = 64,          /* points that decide along which dimension a set is split */
+    SLICE = 256,           /* queries at least that are worth a thread's while */
+    SLICES_PER_THREAD = 8, /* at most, as some take longer */
 };
 
 typedef float Lanes __attribute__((vector_size(4 * LANES)));
@@ -43,8 +47,8 @@ typedef int32_t Integers __attribute__((vector_size(4 * LANES)));
 static const float FARTHEST = 5e17f, LARGEST = 3e38f;
 
 typedef struct {
-    const float *leaves; /* (L, D, WIDTH) */
-    const float *boxes;  /* (2 L - 1, 2, D) corners; node k has the children 2 k + 1 and 2 k + 2, leaf i is node L - 1 + i */
+    const float *leaves; /* (L, D, WIDTH); leaf i is node L - 1 + i */
+    const float *boxes;  /* (2 L - 1, 2, D) corners; node k has the children 2 k + 1 and 2 k + 2 */
     const float *centre; /* (D,) from which leaves and boxes are seen */
     Py_ssize_t n_leaves, dim;
     float scale; /* log2(e) / 2h^2 */
@@ -219,7 +223,9 @@ INLINE void go_to(const float *leaf, Group *group, Py_ssize_t i, const Lanes squ
     for (Py_ssize_t d = 0; d < dim; d++) group->way[i * dim + d] = leaf[d * WIDTH + slot] - group->places[i * dim + d];
 }
 
-INLINE void visit_leaf(const Tree *tree, const float *leaf, Group *group, Py_ssize_t i, const Py_ssize_t dim, const Aim aim) {
+INLINE void visit_leaf(
+    const Tree *tree, const float *leaf, Group *group, Py_ssize_t i, const Py_ssize_t dim, const Aim aim
+) {
     Lanes squares[VECTORS];
     distances(leaf, group->places + i * dim, dim, squares);
     Lanes least = squares[0];
@@ -232,7 +238,8 @@ INLINE void visit_leaf(const Tree *tree, const float *leaf, Group *group, Py_ssi
         else
             shrink(group, i, exp2f(tree->scale * (nearest - before)), dim);
     }
-    if (aim == SUMS && !(tree->scale * (nearest - before) > tree->reach)) add_kernels(tree, leaf, group, i, squares, dim);
+    const int counts = !(tree->scale * (nearest - before) > tree->reach);
+    if (aim == SUMS && counts) add_kernels(tree, leaf, group, i, squares, dim);
 }
 
 /* ---- Walking down the tree --------------------------------------------------------------------------------------- */
@@ -334,11 +341,20 @@ static void scatter_way(const Group *group, Py_ssize_t dim, const int64_t *order
         memcpy(offsets + order[i] * dim, group->way + i * dim, dim * sizeof *offsets);
 }
 
-/* For n of the queries, in an order that changes: either offsets, if wanted, and log sums, or offsets to the nearest anchor
-   where `log_sums` is NULL. False without memory. */
-static int visit(
-    const Tree *tree, const float *queries, int64_t *order, Py_ssize_t n, float *offsets, float *log_sums
-) {
+/* What to do for n of the queries, in an order that changes: log sums, and offsets to local means unless NULL; without
+   log sums, offsets to the nearest anchor. */
+typedef struct {
+    const Tree *tree;
+    const float *queries;
+    int64_t *order;
+    Py_ssize_t n;
+    float *offsets, *log_sums;
+    Py_ssize_t n_slices, next_slice; /* that threads take one after the other */
+    int has_memory;
+} Job;
+
+static int do_slice(const Job *job, int64_t *order, Py_ssize_t n) {
+    const Tree *tree = job->tree;
     const Py_ssize_t dim = tree->dim, row = GROUP * (1 + dim);
     Lanes *sums = aligned_alloc(sizeof(Lanes), row * sizeof(Lanes));
     double *totals = malloc(row * sizeof *totals);
@@ -351,15 +367,15 @@ static int visit(
         group.low = group.way + GROUP * dim;
         group.high = group.low + dim;
         group.nearest = group.high + dim;
-        sort(queries, dim, order, n, GROUP);
+        sort(job->queries, dim, order, n, GROUP);
         for (Py_ssize_t i = 0; i < n; i += GROUP) {
-            gather(&group, tree, queries, order + i, n - i < GROUP ? n - i : GROUP);
-            if (log_sums) {
+            gather(&group, tree, job->queries, order + i, n - i < GROUP ? n - i : GROUP);
+            if (job->log_sums) {
                 sum_up(tree, &group);
-                scatter_sums(&group, tree, order + i, offsets, log_sums);
+                scatter_sums(&group, tree, order + i, job->offsets, job->log_sums);
             } else {
                 look_around(tree, &group);
-                scatter_way(&group, dim, order + i, offsets);
+                scatter_way(&group, dim, order + i, job->offsets);
             }
         }
     }
@@ -367,12 +383,45 @@ static int visit(
     return has_memory;
 }
 
-static int sum_all(const Tree *tree, const float *queries, Py_ssize_t n, float *offsets, float *log_sums) {
+static void do_slices(void *pointer) {
+    Job *job = pointer;
+    Py_ssize_t slice;
+    while ((slice = __atomic_fetch_add(&job->next_slice, 1, __ATOMIC_RELAXED)) < job->n_slices) {
+        const Py_ssize_t start = slice * job->n / job->n_slices, end = (slice + 1) * job->n / job->n_slices;
+        if (!do_slice(job, job->order + start, end - start)) __atomic_store_n(&job->has_memory, 0, __ATOMIC_RELAXED);
+    }
+}
+
+/* False without memory. The threads are those of PyTorch's OpenMP: others would have to share the cores with them, as they
+   keep spinning for a while after their work. */
+static int do_job(Job *job, int n_threads) {
+    typedef void Parallel(void (*)(void *), void *, unsigned, unsigned);
+    Parallel *parallel = NULL;
+    job->has_memory = 1;
+    job->n_slices = 1;
+    if (n_threads > 1 && job->n > SLICE) *(void **)&parallel = dlsym(RTLD_DEFAULT, "GOMP_parallel");
+    if (parallel) {
+        job->n_slices += job->n / SLICE;
+        if (job->n_slices > n_threads * SLICES_PER_THREAD) job->n_slices = n_threads * SLICES_PER_THREAD;
+        parallel(do_slices, job, n_threads, 0);
+    } else {
+        do_slices(job);
+    }
+    return job->has_memory;
+}
+
+static int64_t *indices(Py_ssize_t n) {
     int64_t *order = malloc((n + 1) * sizeof *order);
-    if (!order) return 0;
-    for (Py_ssize_t i = 0; i < n; i++) order[i] = i;
-    const int has_memory = visit(tree, queries, order, n, offsets, log_sums);
-    free(order);
+    for (Py_ssize_t i = 0; order && i < n; i++) order[i] = i;
+    return order;
+}
+
+static int sum_all(
+    const Tree *tree, const float *queries, Py_ssize_t n, float *offsets, float *log_sums, int n_threads
+) {
+    Job job = {.tree = tree, .queries = queries, .order = indices(n), .n = n, .offsets = offsets, .log_sums = log_sums};
+    const int has_memory = job.order && do_job(&job, n_threads);
+    free(job.order);
     return has_memory;
 }
 
@@ -387,19 +436,21 @@ static Py_ssize_t keep_low(int64_t *order, Py_ssize_t n, const float *values, fl
 /* The way to the nearest target for queries whose log sum is not above the threshold; known lower bounds, or NULL. */
 static int lead_all_to_targets(
     const Tree *tree, const Tree *targets, const float *queries, Py_ssize_t n, const float *at_least, float threshold,
-    float *offsets
+    float *offsets, int n_threads
 ) {
-    int64_t *order = malloc((n + 1) * sizeof *order);
     float *log_sums = malloc((n + 1) * sizeof *log_sums);
-    int has_memory = order && log_sums;
+    Job look = {.tree = tree, .queries = queries, .order = indices(n), .n = n, .log_sums = log_sums};
+    int has_memory = look.order && log_sums;
     if (has_memory) {
-        for (Py_ssize_t i = 0; i < n; i++) order[i] = i;
-        if (at_least) n = keep_low(order, n, at_least, threshold);
-        has_memory = visit(tree, queries, order, n, NULL, log_sums);
-        n = keep_low(order, n, log_sums, threshold);
-        has_memory = has_memory && visit(targets, queries, order, n, offsets, NULL);
+        if (at_least) look.n = keep_low(look.order, n, at_least, threshold);
+        has_memory = do_job(&look, n_threads);
     }
-    free(order), free(log_sums);
+    if (has_memory) {
+        Job lead = {.tree = targets, .queries = queries, .order = look.order, .offsets = offsets};
+        lead.n = keep_low(look.order, look.n, log_sums, threshold);
+        has_memory = do_job(&lead, n_threads);
+    }
+    free(look.order), free(log_sums);
     return has_memory;
 }
 
@@ -459,14 +510,18 @@ static PyObject *order_points(PyObject *module, PyObject *args) {
 static PyObject *sum_kernels(PyObject *module, PyObject *args) {
     HeldTree held;
     Py_buffer queries, offsets, log_sums;
+    int n_threads;
     Tree tree;
-    if (!PyArg_ParseTuple(args, HELD_TREE "y*w*w*", POINTERS_TO(held), &queries, &offsets, &log_sums)) return NULL;
+    if (!PyArg_ParseTuple(
+            args, HELD_TREE "y*w*w*i", POINTERS_TO(held), &queries, &offsets, &log_sums, &n_threads
+        ))
+        return NULL;
     const Py_ssize_t n = n_floats(&log_sums);
     const int fits = read_tree(&held, &tree) && n_floats(&queries) == n * tree.dim && offsets.len == queries.len;
     int has_memory = 1;
     if (fits) {
         Py_BEGIN_ALLOW_THREADS;
-        has_memory = sum_all(&tree, queries.buf, n, offsets.buf, log_sums.buf);
+        has_memory = sum_all(&tree, queries.buf, n, offsets.buf, log_sums.buf, n_threads);
         Py_END_ALLOW_THREADS;
     }
     release(&held), PyBuffer_Release(&queries), PyBuffer_Release(&offsets), PyBuffer_Release(&log_sums);
@@ -477,10 +532,11 @@ static PyObject *lead_to_targets(PyObject *module, PyObject *args) {
     HeldTree held, held_targets;
     Py_buffer queries, at_least, offsets;
     float threshold;
+    int n_threads;
     Tree tree, targets;
     if (!PyArg_ParseTuple(
-            args, HELD_TREE HELD_TREE "y*z*fw*", POINTERS_TO(held), POINTERS_TO(held_targets), &queries, &at_least,
-            &threshold, &offsets
+            args, HELD_TREE HELD_TREE "y*z*fw*i", POINTERS_TO(held), POINTERS_TO(held_targets), &queries, &at_least,
+            &threshold, &offsets, &n_threads
         ))
         return NULL;
     const int fits = read_tree(&held, &tree) && read_tree(&held_targets, &targets) && tree.dim == targets.dim
@@ -490,7 +546,9 @@ static PyObject *lead_to_targets(PyObject *module, PyObject *args) {
     if (fits) {
         Py_BEGIN_ALLOW_THREADS;
         const Py_ssize_t n = n_floats(&queries) / tree.dim;
-        has_memory = lead_all_to_targets(&tree, &targets, queries.buf, n, at_least.buf, threshold, offsets.buf);
+        has_memory = lead_all_to_targets(
+            &tree, &targets, queries.buf, n, at_least.buf, threshold, offsets.buf, n_threads
+        );
         Py_END_ALLOW_THREADS;
     }
     release(&held), release(&held_targets);

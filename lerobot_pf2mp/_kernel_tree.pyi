@@ -13,11 +13,17 @@ LEAF_SIZE: int
 def order_points(points: NDArray, order: NDArray) -> None:
     """Fills `order` ``(N,)`` int64 so that every LEAF_SIZE successive points ``(N, D)`` are a leaf's."""
 
-def sum_kernels(tree: Tree, queries: NDArray, offsets: NDArray, log_sums: NDArray) -> None:
+def sum_kernels(tree: Tree, queries: NDArray, offsets: NDArray, log_sums: NDArray, n_threads: int) -> None:
     """Fills `offsets` ``(Q, D)`` to the local means and `log_sums` ``(Q,)`` of the kernels at queries ``(Q, D)``."""
 
 def lead_to_targets(
-    tree: Tree, targets: Tree, queries: NDArray, at_least: NDArray | None, threshold: float, offsets: NDArray
+    tree: Tree,
+    targets: Tree,
+    queries: NDArray,
+    at_least: NDArray | None,
+    threshold: float,
+    offsets: NDArray,
+    n_threads: int,
 ) -> None:
     """Fills `offsets` ``(Q, D)``, to the nearest target, of queries whose log sum is not above the threshold.
 

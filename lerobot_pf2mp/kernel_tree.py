@@ -7,12 +7,9 @@ It leaves out the anchors that are too far away to count. Where it could not be 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -29,10 +26,7 @@ _LEFT_OUT = 1e-7
 
 # Anchors further from the origin than this count as this far; the missing ones of a leaf that is not full are further.
 _FARTHEST, _MISSING = 5e17, 1e19
-_LARGEST_SCALE = 1e30
-
-# Queries that are worth a thread of their own.
-_QUERIES_PER_THREAD = 512
+_SMALLEST_SCALE, _LARGEST_SCALE = 1e-30, 1e30  # that leave room for squared distances
 
 
 def is_available() -> bool:
@@ -76,7 +70,7 @@ class KernelTree:
             leaves.transpose(1, 2).contiguous(),
             _boxes_around(leaves),
             centre,
-            scale=min(math.log2(math.e) / (2 * bandwidth**2), _LARGEST_SCALE),
+            scale=min(max(math.log2(math.e) / 2 / bandwidth / bandwidth, _SMALLEST_SCALE), _LARGEST_SCALE),
             reach=math.log2(n_anchors / _LEFT_OUT),
         )
 
@@ -84,9 +78,8 @@ class KernelTree:
         """The offsets ``(Q, D)`` to the local means and the log sums ``(Q,)`` at float32 queries ``(Q, D)``."""
         queries = queries.contiguous()
         offsets, log_sums = torch.empty_like(queries), torch.empty(len(queries))
-        _in_threads(
-            lambda q, m, s: _kernel_tree.sum_kernels(self._held, q, m, s),
-            [queries.numpy(), offsets.numpy(), log_sums.numpy()],
+        _kernel_tree.sum_kernels(
+            self._held, queries.numpy(), offsets.numpy(), log_sums.numpy(), torch.get_num_threads()
         )
         return offsets, log_sums
 
@@ -106,30 +99,21 @@ class KernelTree:
         """
         queries = queries.contiguous()
         offsets = torch.zeros_like(queries)
-        arrays = [queries.numpy(), offsets.numpy()]
-        if log_sums_at_least is not None:
-            arrays.append(log_sums_at_least.contiguous().numpy())
-        _in_threads(
-            lambda q, out, at_least=None: _kernel_tree.lead_to_targets(
-                self._held, targets._held, q, at_least, log_sum, out
-            ),
-            arrays,
+        at_least = None if log_sums_at_least is None else log_sums_at_least.contiguous().numpy()
+        _kernel_tree.lead_to_targets(
+            self._held,
+            targets._held,
+            queries.numpy(),
+            at_least,
+            log_sum,
+            offsets.numpy(),
+            torch.get_num_threads(),
         )
         return offsets
 
     @cached_property
     def _held(self) -> tuple[NDArray, NDArray, NDArray, float, float]:
         return self.leaves.numpy(), self.boxes.numpy(), self.centre.numpy(), self.scale, self.reach
-
-
-def _in_threads(fill: Callable[..., None], arrays: list[NDArray]) -> None:
-    """Calls `fill` with arrays ``(Q, ...)``, or with slices of them in several threads."""
-    n_threads = min(torch.get_num_threads(), 1 + len(arrays[0]) // _QUERIES_PER_THREAD)
-    if n_threads == 1:
-        fill(*arrays)
-        return
-    with ThreadPoolExecutor(n_threads) as pool:
-        list(pool.map(fill, *(np.array_split(array, n_threads) for array in arrays)))
 
 
 def _boxes_around(leaves: Tensor) -> Tensor:

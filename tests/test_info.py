@@ -37,7 +37,7 @@ PACKAGES = (
     "accelerate",
 )
 ESSENTIAL = ("python", *PACKAGES, "discovery", "device", "simulation")
-OTHERS = ("lerobot-train", "rendering", "video", "experts", "async (grpc)", "peft", "wandb")
+OTHERS = ("lerobot-train", "extension", "rendering", "video", "experts", "async (grpc)", "peft", "wandb")
 # Trials that do not answer in time are as good as none, where only the rest matters.
 WITHOUT_TRIALS = "--time_limit=0.001"
 
@@ -300,6 +300,7 @@ def test_the_extras_that_are_recommended_ask_for_their_packages() -> None:
     assert [package for package, _, _ in EXTRAS.values() if not wanted.get(package)] == []
 
 
+BUILD = "install a C compiler, then pip install --force-reinstall --no-deps . in its folder"
 NO_GPU = {"cores": 2, "gpus": [], "mps": False, "said": ""}
 ENCODERS = {"libx264": "", "libsvtav1": "UnknownCodecError: libsvtav1"}
 
@@ -334,6 +335,13 @@ ENCODERS = {"libx264": "", "libsvtav1": "UnknownCodecError: libsvtav1"}
             ("A, no B", "problem", "AssertionError"),
         ),
         ("rendering", {"backend": "osmesa"}, ("OSMesa", "ok", "")),
+        ("extension", {"is_built": True}, ("compiled", "ok", "")),
+        ("extension", {"is_built": False}, ("not built", "optional", f"fields are slower on a CPU: {BUILD}")),
+        (
+            "extension",
+            {"error": "ImportError: no"},
+            ("cannot be loaded", "optional", f"ImportError: no: fields are slower on a CPU: {BUILD}"),
+        ),
     ],
 )
 def test_what_answers_mean_that_this_machine_may_not_give(

@@ -15,6 +15,7 @@ import re
 import shutil
 import sys
 import warnings
+from importlib.machinery import EXTENSION_SUFFIXES
 from importlib.metadata import distributions
 from pathlib import Path
 from types import ModuleType
@@ -22,6 +23,7 @@ from typing import Any
 
 DISTRIBUTION = "lerobot_policy_pf2mp"
 PACKAGE = "lerobot_pf2mp"
+EXTENSION = "_kernel_tree"
 
 _BALL = "<mujoco><worldbody><light pos='0 0 3'/><geom size='1'/></worldbody></mujoco>"
 _SIMULATIONS = ("PointMaze_UMaze-v3", "FetchReach-v4")
@@ -140,7 +142,17 @@ def video() -> dict[str, Any]:
     return answer
 
 
-PROBES = {probe.__name__: probe for probe in (discovery, device, simulation, rendering, video)}
+def extension() -> dict[str, Any]:
+    """Whether the C extension has been built; one that cannot be loaded is an error."""
+    folder = _package_folder()
+    files = [folder / f"{EXTENSION}{suffix}" for suffix in EXTENSION_SUFFIXES]
+    built = [file for file in files if file.exists()]
+    for file in built[:1]:
+        _module_from(file, EXTENSION)
+    return {"is_built": bool(built)}
+
+
+PROBES = {probe.__name__: probe for probe in (discovery, device, extension, simulation, rendering, video)}
 
 
 def _ours(choices: dict[str, type]) -> list[str]:
@@ -161,11 +173,18 @@ def _n_cores() -> int:
 
 def _headless() -> ModuleType:
     """`lerobot_pf2mp.envs.headless`, without importing the rest of the package, which may fail."""
+    return _module_from(_package_folder() / "envs" / "headless.py", "headless")
+
+
+def _package_folder() -> Path:
     package = importlib.util.find_spec(PACKAGE)
     if package is None or not package.submodule_search_locations:
         raise ImportError(f"no module named {PACKAGE}")
-    path = Path(package.submodule_search_locations[0]) / "envs" / "headless.py"
-    spec = importlib.util.spec_from_file_location("headless", path)
+    return Path(package.submodule_search_locations[0])
+
+
+def _module_from(path: Path, name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise ImportError(f"{path} cannot be imported")
     module = importlib.util.module_from_spec(spec)

@@ -75,6 +75,16 @@ def device_line(answer: dict[str, Any]) -> Line:
     return Line("device", value)
 
 
+def extension_line(answer: dict[str, Any]) -> Line:
+    """Whether potential fields are looked up by the C extension, on a CPU."""
+    remedy = "fields are slower on a CPU: install a C compiler, then pip install --force-reinstall --no-deps . in its folder"
+    if "error" in answer:
+        return Line("extension", "cannot be loaded", OPTIONAL, f"{answer['error']}: {remedy}")
+    if not answer["is_built"]:
+        return Line("extension", "not built", OPTIONAL, remedy)
+    return Line("extension", "compiled")
+
+
 def simulation_line(answer: dict[str, Any]) -> Line:
     """Whether MuJoCo and the environments of gymnasium-robotics run."""
     errors = {"MuJoCo": answer["error"]} if "error" in answer else answer["errors"]
@@ -112,6 +122,7 @@ def video_line(answer: dict[str, Any]) -> Line:
 LINES = {
     "discovery": discovery_line,
     "device": device_line,
+    "extension": extension_line,
     "simulation": simulation_line,
     "rendering": rendering_line,
     "video": video_line,
