@@ -37,10 +37,12 @@ typedef int32_t Integers __attribute__((vector_size(4 * LANES)));
 #define INLINE static inline __attribute__((always_inline))
 
 /* One variant for each kind of processor, the fitting one being chosen when the module is loaded. */
-#if defined(__x86_64__) && defined(__GLIBC__) && !defined(__clang__)
+#if !defined(__x86_64__) || !defined(__GLIBC__)
+#define FOR_EACH_PROCESSOR
+#elif !defined(__clang__) && __GNUC__ >= 12
 #define FOR_EACH_PROCESSOR __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
 #else
-#define FOR_EACH_PROCESSOR
+#define FOR_EACH_PROCESSOR __attribute__((target_clones("avx512f", "avx2", "default")))
 #endif
 
 /* Queries further out than this count as this far; slots without an anchor are further out still. */
