@@ -3,9 +3,8 @@
 
 import math
 import shutil
+import sys
 import sysconfig
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -17,21 +16,15 @@ from lerobot_pf2mp import kernel_tree
 from lerobot_pf2mp.kernel_sums import KernelSums
 from lerobot_pf2mp.kernel_tree import KernelTree
 
+sys.path.append(str(Path(__file__).parent / "benchmarks"))
+
+from harness import threads
+
 CAN_BE_BUILT = shutil.which("cc") and Path(sysconfig.get_path("include"), "Python.h").exists()
 
 pytestmark = pytest.mark.skipif(
     not (kernel_tree.is_available() or CAN_BE_BUILT), reason="there is no C compiler, or no Python.h"
 )
-
-
-@contextmanager
-def torch_threads(n_threads: int) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(n_threads)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("n_anchors", [63, 64, 65, 128, 129, 190, 200, 321, 700, 5000])
@@ -64,7 +57,7 @@ def test_threads_change_nothing(n_threads: int) -> None:
     tree = KernelTree.of(paths(3000, 3), 0.05)
     queries = paths(2500, 3, seed=1)
     one_by_one = [torch.cat(x) for x in zip(*(tree.sums(q) for q in queries.split(1)), strict=True)]
-    with torch_threads(n_threads):
+    with threads(n_threads):
         for found, wanted in zip(tree.sums(queries), one_by_one, strict=True):
             torch.testing.assert_close(found, wanted, rtol=1e-5, atol=1e-5)
 
@@ -100,7 +93,7 @@ def test_the_way_to_the_nearest_target_is_that_of_all_distances(dim: int, n_thre
     log_sum = log_sums.median().item()
     distances = torch.cdist(queries.double(), targets.double(), compute_mode="donot_use_mm_for_euclid_dist")
     wanted = (targets[distances.argmin(dim=1)] - queries) * (log_sums <= log_sum).unsqueeze(1)
-    with torch_threads(n_threads):
+    with threads(n_threads):
         for at_least in (None, log_sums.float() - 1e-3 - torch.rand(1500)):
             found = sums.tree.offsets_to(KernelTree.of(targets, 0.05), queries, log_sum, at_least)
             is_clear = (log_sums - log_sum).abs() > 1e-4
