@@ -26,8 +26,9 @@ enum {
     MAX_DEPTH = 64,
     LEAVES_IN_SINGLE = 64, /* that are added up in single precision before they join the totals */
     SAMPLED = 64,          /* points that decide along which dimension a set is split */
-    SLICE = 256,           /* queries at least that are worth a thread's while */
+    SLICE = 256,           /* queries in one go, if there are enough of them for all threads */
     SLICES_PER_THREAD = 8, /* at most, as some take longer */
+    WORK = 1 << 20,        /* queries x anchors x dimensions that are worth a thread's while */
 };
 
 typedef float Lanes __attribute__((vector_size(4 * LANES)));
@@ -150,10 +151,12 @@ INLINE float lowest(Lanes a) {
     return lanes[0];
 }
 
-INLINE double sum(Lanes a) {
-    double total = 0.0;
-    for (int i = 0; i < LANES; i++) total += a[i];
-    return total;
+INLINE float sum(Lanes a) {
+    float lanes[LANES];
+    memcpy(lanes, &a, sizeof a);
+    for (int half = LANES / 2; half; half /= 2)
+        for (int i = 0; i < half; i++) lanes[i] += lanes[i + half];
+    return lanes[0];
 }
 
 /* 2^x for x <= 0, with a relative error of 1e-7; 0 below 2^-125. */
@@ -394,17 +397,27 @@ static void do_slices(void *pointer) {
     }
 }
 
+static Py_ssize_t smaller(Py_ssize_t a, Py_ssize_t b) { return a < b ? a : b; }
+
+/* As many slices as are worth it, of one group at least. */
+static Py_ssize_t n_slices_of(const Job *job, int n_threads) {
+    const double work = (double)job->n * job->tree->n_leaves * WIDTH * job->tree->dim / WORK;
+    Py_ssize_t n_slices = 1 + job->n / SLICE;
+    if (n_slices < n_threads) n_slices = n_threads;
+    n_slices = smaller(n_slices, smaller(n_threads * SLICES_PER_THREAD, job->n / GROUP));
+    if (n_slices > work) n_slices = (Py_ssize_t)work;
+    return n_slices > 1 ? n_slices : 1;
+}
+
 /* False without memory. The threads are those of PyTorch's OpenMP: others would have to share the cores with them, as they
    keep spinning for a while after their work. */
 static int do_job(Job *job, int n_threads) {
     typedef void Parallel(void (*)(void *), void *, unsigned, unsigned);
     Parallel *parallel = NULL;
     job->has_memory = 1;
-    job->n_slices = 1;
-    if (n_threads > 1 && job->n > SLICE) *(void **)&parallel = dlsym(RTLD_DEFAULT, "GOMP_parallel");
+    job->n_slices = n_threads > 1 ? n_slices_of(job, n_threads) : 1;
+    if (job->n_slices > 1) *(void **)&parallel = dlsym(RTLD_DEFAULT, "GOMP_parallel");
     if (parallel) {
-        job->n_slices += job->n / SLICE;
-        if (job->n_slices > n_threads * SLICES_PER_THREAD) job->n_slices = n_threads * SLICES_PER_THREAD;
         parallel(do_slices, job, n_threads, 0);
     } else {
         do_slices(job);

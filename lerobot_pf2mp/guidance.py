@@ -30,7 +30,7 @@ GUIDANCE_INTEGRATORS = ("euler", "proximal")
 GUIDANCE_POINTS = ("current", "end", "next")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class EulerGuide:
     """Algorithm 2 as printed: x_{t+dt} = x_t + [v + lambda Phi(x_t)] dt.
 
@@ -50,7 +50,7 @@ class EulerGuide:
         return x_next + self.scale * dt * self.field.potential_gradient(a)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ProximalGuide:
     """The guidance solved exactly over the step, after the flow's own step.
 
@@ -126,7 +126,7 @@ def make_guide(
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _OnDimensions:
     """A guide that acts on some of the action dimensions."""
 

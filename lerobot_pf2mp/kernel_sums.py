@@ -2,7 +2,7 @@
 """Sums of Gaussian kernels over anchors: their logarithm, and the kernel-weighted mean of the anchors.
 
 Three ways to the same numbers: on a CPU a walk down a tree of the anchors (kernel_tree.py); where that could not be built,
-and under ``torch.compile``, one attention call; on other devices softmax and sum, block by block.
+and in a compiled graph if there is no tree yet, one attention call; on other devices softmax and sum, block by block.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ class KernelSums:
     @property
     def has_tree(self) -> bool:
         """Whether the sums come from a walk down `tree`."""
-        is_on_cpu = self.anchors.device.type == "cpu"
-        return is_on_cpu and kernel_tree.is_available() and not torch.compiler.is_compiling()
+        is_possible = self.anchors.device.type == "cpu" and kernel_tree.is_available()
+        return is_possible and ("tree" in vars(self) or not torch.compiler.is_compiling())
 
     @cached_property
     def tree(self) -> KernelTree:

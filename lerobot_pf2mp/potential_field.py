@@ -75,6 +75,15 @@ class PotentialField:
             return self
         return PotentialField(anchors, self.bandwidth, self.log_threshold, self.alpha)
 
+    @cached_property
+    def prepared(self) -> PotentialField:
+        """This field, with everything computed that lookups share, which is otherwise done when it is first needed.
+
+        A graph of ``torch.compile`` that is traced before would do it in each call.
+        """
+        self.potential_gradient(self.anchors[:1])
+        return self
+
     @torch.no_grad()
     def log_density(self, a: Tensor) -> Tensor:
         """The log density log p(a), normalised over R^D.

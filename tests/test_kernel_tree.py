@@ -53,9 +53,10 @@ def test_leaves_are_small_parts_of_space() -> None:
 
 
 @pytest.mark.parametrize("n_threads", [1, 2, 3])
-def test_threads_change_nothing(n_threads: int) -> None:
-    tree = KernelTree.of(paths(3000, 3), 0.05)
-    queries = paths(2500, 3, seed=1)
+@pytest.mark.parametrize(("n_queries", "dim"), [(2500, 3), (90, 20), (33, 20), (5, 20)])
+def test_threads_change_nothing(n_threads: int, n_queries: int, dim: int) -> None:
+    tree = KernelTree.of(paths(3000, dim), 0.05)
+    queries = paths(n_queries, dim, seed=1)
     one_by_one = [torch.cat(x) for x in zip(*(tree.sums(q) for q in queries.split(1)), strict=True)]
     with threads(n_threads):
         for found, wanted in zip(tree.sums(queries), one_by_one, strict=True):

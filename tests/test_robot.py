@@ -127,6 +127,29 @@ def test_a_rollout_with_real_time_chunking_moves_the_arm_near_the_demonstrations
     assert distance_from_demonstrations(log, postures) < 0.2
 
 
+@pytest.mark.parametrize("inference", ["sync", "rtc"])
+def test_a_compiled_policy_moves_the_arm_near_the_demonstrations(
+    inference: str, demonstrated: tuple[Path, np.ndarray], tmp_path: Path
+) -> None:
+    checkpoint, postures = demonstrated
+    log = tmp_path / "compiled.jsonl"
+    run_well(
+        "lerobot-rollout",
+        f"--policy.path={checkpoint}",
+        "--device=cpu",
+        f"--inference.type={inference}",
+        "--use_torch_compile=true",
+        "--torch_compile_backend=eager",  # what can go wrong is the capturing, not inductor, which takes a minute more
+        *ROBOT,
+        f"--robot.log={log}",
+        "--fps=10",
+        "--duration=20",
+        "--play_sounds=false",
+        "--return_to_initial_position=false",
+    )
+    assert distance_from_demonstrations(log, postures) < 0.2
+
+
 @contextmanager
 def policy_server(folder: Path) -> Iterator[str]:
     """The address of a pf2mp-policy-server that runs in a folder, where LeRobot writes its log."""

@@ -62,6 +62,7 @@ class PotentialFieldGuidance:
             dataset_id=self._dataset_id,
         )
 
+    @torch.compiler.disable  # the field may have to be fitted first
     def make_guide(self, batch: dict[str, Any], device: torch.device) -> Guide | None:
         """The configured guide over the batch's field; None with a guidance scale of 0.
 
@@ -77,7 +78,7 @@ class PotentialFieldGuidance:
             return None
         field = fitted_field(batch.get(POTENTIAL_FIELD), config, device)
         return make_guide(
-            field,
+            field.prepared,
             config.guidance_scale,
             config.guidance_integrator,
             config.field_action_dims,

@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Policies and fields under ``torch.compile``."""
+
+from typing import Any
+
+import pytest
+import torch
+from demonstrated_paths import paths
+from lerobot.configs import FeatureType, PolicyFeature
+from torch import Tensor
+
+from lerobot_pf2mp import FMPConfig, PF2MPConfig, kernel_tree
+from lerobot_pf2mp.kernel_sums import KernelSums
+from lerobot_pf2mp.policies.fmp.modeling_fmp import FMPPolicy
+from lerobot_pf2mp.policies.pf2mp.modeling_pf2mp import PF2MPPolicy
+from lerobot_pf2mp.potential_field import PotentialField, fit
+from lerobot_pf2mp.potential_field_processor import POTENTIAL_FIELD, DemonstratedActions
+
+HORIZON, ACTION_DIM, STATE = 16, 2, "observation.state"
+
+pytestmark = pytest.mark.usefixtures("_fresh_compiler")
+
+
+@pytest.fixture
+def _fresh_compiler() -> None:
+    torch.compiler.reset()
+
+
+@pytest.fixture(params=["extension", "attention"])
+def sums(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Kernel sums from the C extension, and from attention as if it could not be built."""
+    if request.param == "attention":
+        monkeypatch.setattr("lerobot_pf2mp.kernel_tree._kernel_tree", None)
+    elif not kernel_tree.is_available():
+        pytest.skip("the C extension could not be built")
+    return request.param
+
+
+def policy_of(kind: str, **options: Any) -> Any:
+    make_config, make_policy = {"fmp": (FMPConfig, FMPPolicy), "pf2mp": (PF2MPConfig, PF2MPPolicy)}[kind]
+    torch.manual_seed(0)
+    config = make_config(
+        device="cpu",
+        horizon=HORIZON,
+        n_action_steps=HORIZON,
+        down_dims=(8, 16),
+        n_groups=4,
+        diffusion_step_embed_dim=16,
+        input_features={STATE: PolicyFeature(FeatureType.STATE, (3,))},
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (ACTION_DIM,))},
+        **options,
+    )
+    return make_policy(config).eval()
+
+
+def batches_for(policy: Any, n: int) -> list[dict[str, Any]]:
+    """Observations, each with the field over the same demonstrations."""
+    generator = torch.Generator().manual_seed(1)
+    batches: list[dict[str, Any]] = [{STATE: torch.rand(1, 3, generator=generator)} for _ in range(n)]
+    if isinstance(policy, PF2MPPolicy):
+        demonstrated = DemonstratedActions(policy.config.field_settings)
+        actions = 0.2 * torch.randn(40, HORIZON, ACTION_DIM, generator=generator)
+        demonstrated.observe(actions, None, None, settings=policy.config.field_settings)
+        batches = [{**batch, POTENTIAL_FIELD: demonstrated} for batch in batches]
+    return batches
+
+
+def noises(n: int) -> list[Tensor]:
+    return [
+        torch.randn(1, HORIZON, ACTION_DIM, generator=torch.Generator().manual_seed(seed))
+        for seed in range(n)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [
+        ("fmp", {}),
+        ("pf2mp", {}),
+        ("pf2mp", {"guidance_integrator": "euler"}),
+        ("pf2mp", {"field_alpha": 0.0}),
+        ("pf2mp", {"field_action_dims": (0, 1)}),
+        ("pf2mp", {"compile_model": True}),
+    ],
+    ids=str,
+)
+def test_a_compiled_policy_plans_the_same_and_is_compiled_once(kind: str, options: dict[str, Any]) -> None:
+    policy, n = policy_of(kind, **options), 4
+    batches, noise = batches_for(policy, n), noises(n)
+    compiled = torch.compile(policy.predict_action_chunk, backend="eager")
+    with torch.inference_mode(), torch._dynamo.config.patch(error_on_recompile=True):
+        # As lerobot-rollout does it: the compiled policy is the first one to ask for the field.
+        found = [compiled(dict(batch), noise=x_0) for batch, x_0 in zip(batches, noise, strict=True)]
+    plain = policy_of(kind, **{**options, "compile_model": False})
+    for chunk, batch, x_0 in zip(found, batches, noise, strict=True):
+        wanted = plain.predict_action_chunk(batch, noise=x_0)
+        torch.testing.assert_close(chunk, wanted, rtol=1e-4, atol=1e-5)
+    assert not torch.equal(found[0], found[1])
+
+
+def test_the_steps_of_a_guided_policy_are_one_graph(sums: str) -> None:
+    policy = policy_of("pf2mp")
+    (batch,), (noise,) = batches_for(policy, 1), noises(1)
+    guide = policy.make_guide(batch)
+    compiled = torch.compile(policy.predict_action_chunk, backend="eager", fullgraph=True)
+    chunk = compiled({STATE: batch[STATE]}, noise=noise, guide=guide)
+    torch.testing.assert_close(
+        chunk, policy.predict_action_chunk(batch, noise=noise), rtol=1e-4, atol=1e-5
+    )
+
+
+def test_a_compiled_policy_watches_its_plans() -> None:
+    policy = policy_of("pf2mp", on_unsupported="hold", guidance_scale=0.0)
+    (batch,), (noise,) = batches_for(policy, 1), noises(1)
+    chunk = torch.compile(policy.predict_action_chunk, backend="eager")(dict(batch), noise=3 * noise)
+    support = policy.support
+    policy.reset()
+    torch.testing.assert_close(chunk, policy.predict_action_chunk(batch, noise=3 * noise))
+    assert (support < 0).any()
+    torch.testing.assert_close(support, policy.support)
+
+
+@pytest.mark.parametrize("is_prepared", [True, False])
+def test_compiled_sums_are_the_same(is_prepared: bool, sums: str) -> None:
+    kernel_sums = KernelSums(paths(1000, 2), 0.02)
+    queries = paths(100, 2, seed=1)
+    wanted = KernelSums(kernel_sums.anchors, 0.02)(queries)
+    if is_prepared:
+        kernel_sums(queries[:1])
+    found = torch.compile(kernel_sums.__call__, backend="eager", fullgraph=True)(queries)
+    for one, other in zip(found, wanted, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+
+
+def test_a_compiled_field_is_the_same(sums: str) -> None:
+    points = paths(1000, 2)
+    field = fit(points, threshold_quantile=0.2, alpha=-1.0).prepared
+    a = points[:200] + 5 * field.bandwidth * torch.randn(200, 2)
+    assert (field.offset_to_safe_set(a) != 0).any()
+    for name in ("log_density", "score", "offset_to_safe_set", "potential", "potential_gradient"):
+        lookup = getattr(PotentialField, name)
+        found = torch.compile(lookup, backend="eager", fullgraph=True)(field, a)
+        torch.testing.assert_close(found, lookup(field, a), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.skipif(not kernel_tree.is_available(), reason="the C extension could not be built")
+@pytest.mark.parametrize("has_bound", [True, False])
+def test_the_extension_is_an_operator(has_bound: bool) -> None:
+    tree = KernelSums(paths(300, 2), 0.05).tree
+    held = (tree.leaves, tree.boxes, tree.centre, tree.scale, tree.reach)
+    queries = paths(50, 2, seed=1)
+    torch.library.opcheck(kernel_tree.sum_kernels, (*held, queries))
+    bound = torch.rand(50) if has_bound else None
+    torch.library.opcheck(kernel_tree.lead_to_targets, (*held, *held[:3], queries, 0.5, bound))
