@@ -456,6 +456,7 @@ static int lead_all_to_targets(
     float *log_sums = malloc((n + 1) * sizeof *log_sums);
     Job look = {.tree = tree, .queries = queries, .order = indices(n), .n = n, .log_sums = log_sums};
     int has_memory = look.order && log_sums;
+    memset(offsets, 0, n * tree->dim * sizeof *offsets);
     if (has_memory) {
         if (at_least) look.n = keep_low(look.order, n, at_least, threshold);
         has_memory = do_job(&look, n_threads);
@@ -466,6 +467,40 @@ static int lead_all_to_targets(
         has_memory = do_job(&lead, n_threads);
     }
     free(look.order), free(log_sums);
+    return has_memory;
+}
+
+/* A share of the way to the local mean, and from there the way to the nearest target as far as `reach`, where the log sum
+   is not above the threshold. */
+static int step_all_to_targets(
+    const Tree *tree, const Tree *targets, const float *queries, Py_ssize_t n, float threshold, float share, float reach,
+    float *steps, int n_threads
+) {
+    const Py_ssize_t dim = tree->dim;
+    float *log_sums = malloc((n + 1) * sizeof *log_sums);
+    float *places = malloc((n * dim + 1) * sizeof *places), *ways = malloc((n * dim + 1) * sizeof *ways);
+    int has_memory = log_sums && places && ways && sum_all(tree, queries, n, steps, log_sums, n_threads);
+    if (has_memory) {
+        const double gain = share * (2.0 - share) * M_LN2 * tree->scale;
+        for (Py_ssize_t i = 0; i < n; i++) {
+            double square = 0.0;
+            for (Py_ssize_t d = i * dim; d < (i + 1) * dim; d++) {
+                square += (double)steps[d] * steps[d];
+                steps[d] *= share;
+                places[d] = queries[d] + steps[d];
+            }
+            /* A mean shift raises the log density by at least this (Comaniciu and Meer 2002, Theorem 1). */
+            log_sums[i] = (float)(log_sums[i] + gain * square);
+        }
+        has_memory = lead_all_to_targets(tree, targets, places, n, log_sums, threshold, ways, n_threads);
+    }
+    for (Py_ssize_t i = 0; has_memory && i < n; i++) {
+        double square = 0.0;
+        for (Py_ssize_t d = i * dim; d < (i + 1) * dim; d++) square += (double)ways[d] * ways[d];
+        const float factor = square > (double)reach * reach ? (float)(reach / sqrt(square)) : 1.0f;
+        for (Py_ssize_t d = i * dim; d < (i + 1) * dim; d++) steps[d] += factor * ways[d];
+    }
+    free(log_sums), free(places), free(ways);
     return has_memory;
 }
 
@@ -543,31 +578,66 @@ static PyObject *sum_kernels(PyObject *module, PyObject *args) {
     return answer(fits, has_memory);
 }
 
-static PyObject *lead_to_targets(PyObject *module, PyObject *args) {
+/* What the two functions below share: trees, queries, and where the result goes. */
+typedef struct {
     HeldTree held, held_targets;
-    Py_buffer queries, at_least, offsets;
-    float threshold;
-    int n_threads;
     Tree tree, targets;
+    Py_buffer queries, result;
+    Py_ssize_t n;
+} Way;
+
+static int read_way(Way *way) {
+    const int fits = read_tree(&way->held, &way->tree) && read_tree(&way->held_targets, &way->targets)
+        && way->tree.dim == way->targets.dim && n_floats(&way->queries) % way->tree.dim == 0
+        && way->result.len == way->queries.len;
+    way->n = fits ? n_floats(&way->queries) / way->tree.dim : 0;
+    return fits;
+}
+
+static void release_way(Way *way) {
+    release(&way->held), release(&way->held_targets);
+    PyBuffer_Release(&way->queries), PyBuffer_Release(&way->result);
+}
+
+static PyObject *lead_to_targets(PyObject *module, PyObject *args) {
+    Way way;
+    float threshold;
+    int n_threads, has_memory = 1;
     if (!PyArg_ParseTuple(
-            args, HELD_TREE HELD_TREE "y*z*fw*i", POINTERS_TO(held), POINTERS_TO(held_targets), &queries, &at_least,
-            &threshold, &offsets, &n_threads
+            args, HELD_TREE HELD_TREE "y*fw*i", POINTERS_TO(way.held), POINTERS_TO(way.held_targets), &way.queries,
+            &threshold, &way.result, &n_threads
         ))
         return NULL;
-    const int fits = read_tree(&held, &tree) && read_tree(&held_targets, &targets) && tree.dim == targets.dim
-        && n_floats(&queries) % tree.dim == 0 && offsets.len == queries.len
-        && (!at_least.buf || n_floats(&at_least) * tree.dim == n_floats(&queries));
-    int has_memory = 1;
+    const int fits = read_way(&way);
     if (fits) {
         Py_BEGIN_ALLOW_THREADS;
-        const Py_ssize_t n = n_floats(&queries) / tree.dim;
         has_memory = lead_all_to_targets(
-            &tree, &targets, queries.buf, n, at_least.buf, threshold, offsets.buf, n_threads
+            &way.tree, &way.targets, way.queries.buf, way.n, NULL, threshold, way.result.buf, n_threads
         );
         Py_END_ALLOW_THREADS;
     }
-    release(&held), release(&held_targets);
-    PyBuffer_Release(&queries), PyBuffer_Release(&at_least), PyBuffer_Release(&offsets);
+    release_way(&way);
+    return answer(fits, has_memory);
+}
+
+static PyObject *step_to_targets(PyObject *module, PyObject *args) {
+    Way way;
+    float threshold, share, reach;
+    int n_threads, has_memory = 1;
+    if (!PyArg_ParseTuple(
+            args, HELD_TREE HELD_TREE "y*fffw*i", POINTERS_TO(way.held), POINTERS_TO(way.held_targets), &way.queries,
+            &threshold, &share, &reach, &way.result, &n_threads
+        ))
+        return NULL;
+    const int fits = read_way(&way);
+    if (fits) {
+        Py_BEGIN_ALLOW_THREADS;
+        has_memory = step_all_to_targets(
+            &way.tree, &way.targets, way.queries.buf, way.n, threshold, share, reach, way.result.buf, n_threads
+        );
+        Py_END_ALLOW_THREADS;
+    }
+    release_way(&way);
     return answer(fits, has_memory);
 }
 
@@ -575,6 +645,7 @@ static PyMethodDef methods[] = {
     {"order_points", order_points, METH_VARARGS, "Sorts points into leaves."},
     {"sum_kernels", sum_kernels, METH_VARARGS, "The offsets to local means, and the logarithms of the sums."},
     {"lead_to_targets", lead_to_targets, METH_VARARGS, "The offsets from where few anchors are to the nearest target."},
+    {"step_to_targets", step_to_targets, METH_VARARGS, "The steps to local means and on to the nearest target."},
     {NULL, NULL, 0, NULL},
 };
 

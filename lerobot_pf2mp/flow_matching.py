@@ -167,11 +167,12 @@ def integrate(
         slope = velocity(x, t)
         if integrator == "midpoint":
             slope = velocity(x + 0.5 * dt * slope, t + 0.5 * dt)
-        x_1 = x + (1 - step * dt) * slope
+        predicted = slope
         if steer is not None:
             slope = steer(x, t, slope)
-        x_next = x + dt * slope
+        x_next = torch.add(x, slope, alpha=dt)
         if guide is not None:
+            x_1 = torch.add(x, predicted, alpha=1 - step * dt)
             x_next = guide(x, x_next, x_1, dt)
         x = x_next
     return x

@@ -24,8 +24,6 @@ from torch import Tensor
 from lerobot_pf2mp.flow_matching import Guide
 from lerobot_pf2mp.potential_field import PotentialField
 
-_TINY = torch.finfo(torch.float32).tiny
-
 GUIDANCE_INTEGRATORS = ("euler", "proximal")
 GUIDANCE_POINTS = ("current", "end", "next")
 
@@ -70,20 +68,11 @@ class ProximalGuide:
 
     def __call__(self, x_t: Tensor, x_next: Tensor, x_1: Tensor, dt: float) -> Tensor:
         """The guided step from the unguided one, all ``(..., D)`` [normalised]."""
-        decay = math.exp(-self.scale * dt / self.field.bandwidth**2)
+        share = 1 - math.exp(-self.scale * dt / self.field.bandwidth**2)
         a = _choose(self.point, x_t, x_next, x_1)
-        log_density, mean_shift = self.field.log_density_and_mean_shift(a)
-        shift = (1 - decay) * mean_shift
-        guided = x_next + shift
-        if self.field.alpha != 0:
-            # A mean shift raises the density by at least this (Comaniciu and Meer 2002, Theorem 1).
-            gain = (1 - decay**2) / (2 * self.field.bandwidth**2)
-            at_least = log_density.add(torch.linalg.vecdot(mean_shift, mean_shift), alpha=gain)
-            offset = self.field.offset_to_safe_set(a + shift, log_density_at_least=at_least)
-            distance = offset.norm(dim=-1, keepdim=True)
-            reach = self.scale * -self.field.alpha * dt
-            guided.addcdiv_(offset, distance.clamp_min_(max(reach, _TINY)), value=reach)
-        return guided
+        if self.field.alpha == 0:
+            return x_next + share * self.field.mean_shift(a)
+        return x_next + self.field.step_to_safety(a, share, reach=self.scale * -self.field.alpha * dt)
 
 
 def make_guide(

@@ -28,9 +28,6 @@ _LEFT_OUT = 1e-7
 _FARTHEST, _MISSING = 5e17, 1e19
 _SMALLEST_SCALE, _LARGEST_SCALE = 1e-30, 1e30  # that leave room for squared distances
 
-# Leaves, boxes, centre, scale and reach, as the extension takes them.
-type HeldTree = tuple[NDArray, NDArray, NDArray, float, float]
-
 
 def is_available() -> bool:
     """Whether the C extension could be built."""
@@ -80,89 +77,93 @@ class KernelTree:
     def sums(self, queries: Tensor) -> tuple[Tensor, Tensor]:
         """The offsets ``(Q, D)`` to the local means and the log sums ``(Q,)`` at float32 queries ``(Q, D)``."""
         if torch.compiler.is_compiling():
-            return sum_kernels(*self._tensors, self.scale, self.reach, queries)
-        return _sums(self._held, queries)
+            return _sums_operator(*self._parts, queries)
+        queries = queries.contiguous()
+        offsets, log_sums = torch.empty_like(queries), torch.empty(len(queries))
+        _kernel_tree.sum_kernels(
+            self._held, queries.numpy(), offsets.numpy(), log_sums.numpy(), torch.get_num_threads()
+        )
+        return offsets, log_sums
 
-    def offsets_to(
-        self, targets: KernelTree, queries: Tensor, log_sum: float, log_sums_at_least: Tensor | None = None
-    ) -> Tensor:
+    def offsets_to(self, targets: KernelTree, queries: Tensor, log_sum: float) -> Tensor:
         """The way from where the kernels add up to little.
 
         Args:
             targets: Where to.
             queries: ``(Q, D)`` float32.
             log_sum: What counts as little.
-            log_sums_at_least: ``(Q,)`` lower bounds of the log sums, where known; they spare looking at those above.
 
         Returns:
             ``(Q, D)`` offsets to the nearest target; zero where the log sum is above `log_sum`.
         """
         if torch.compiler.is_compiling():
-            return lead_to_targets(
-                *self._tensors,
-                self.scale,
-                self.reach,
-                *targets._tensors,
-                queries,
-                log_sum,
-                log_sums_at_least,
-            )
-        return _offsets_to(self._held, targets._held, queries, log_sum, log_sums_at_least)
+            return _offsets_operator(*self._parts, *targets._parts, queries, log_sum)
+        queries = queries.contiguous()
+        offsets = torch.empty_like(queries)
+        _kernel_tree.lead_to_targets(
+            self._held, targets._held, queries.numpy(), log_sum, offsets.numpy(), torch.get_num_threads()
+        )
+        return offsets
+
+    def steps_to(
+        self, targets: KernelTree, queries: Tensor, log_sum: float, share: float, reach: float
+    ) -> Tensor:
+        """Steps towards the local mean, and on to a target from where the kernels add up to little.
+
+        Args:
+            targets: Where to.
+            queries: ``(Q, D)`` float32.
+            log_sum: What counts as little.
+            share: In [0, 1], how much of the way to the local mean.
+            reach: How far at most towards the nearest target.
+
+        Returns:
+            ``(Q, D)`` the steps from the queries.
+        """
+        if torch.compiler.is_compiling():
+            return _steps_operator(*self._parts, *targets._parts, queries, log_sum, share, reach)
+        queries = queries.contiguous()
+        steps = torch.empty_like(queries)
+        _kernel_tree.step_to_targets(
+            self._held,
+            targets._held,
+            queries.numpy(),
+            log_sum,
+            share,
+            reach,
+            steps.numpy(),
+            torch.get_num_threads(),
+        )
+        return steps
 
     @property
-    def _tensors(self) -> tuple[Tensor, Tensor, Tensor]:
-        return self.leaves, self.boxes, self.centre
+    def _parts(self) -> tuple[Tensor, Tensor, Tensor, float, float]:
+        return self.leaves, self.boxes, self.centre, self.scale, self.reach
 
     @cached_property
-    def _held(self) -> HeldTree:
-        return _hold(*self._tensors, self.scale, self.reach)
+    def _held(self) -> tuple[NDArray, NDArray, NDArray, float, float]:
+        return self.leaves.numpy(), self.boxes.numpy(), self.centre.numpy(), self.scale, self.reach
 
 
-def _hold(leaves: Tensor, boxes: Tensor, centre: Tensor, scale: float, reach: float) -> HeldTree:
-    return leaves.numpy(), boxes.numpy(), centre.numpy(), scale, reach
+# A tree's methods as operators, as which compiled graphs call them. Each is followed by the shapes of what it returns.
 
 
-def _sums(held: HeldTree, queries: Tensor) -> tuple[Tensor, Tensor]:
-    queries = queries.contiguous()
-    offsets, log_sums = torch.empty_like(queries), torch.empty(len(queries))
-    _kernel_tree.sum_kernels(
-        held, queries.numpy(), offsets.numpy(), log_sums.numpy(), torch.get_num_threads()
-    )
-    return offsets, log_sums
-
-
-def _offsets_to(
-    held: HeldTree, targets: HeldTree, queries: Tensor, log_sum: float, log_sums_at_least: Tensor | None
-) -> Tensor:
-    queries = queries.contiguous()
-    offsets = torch.zeros_like(queries)
-    at_least = None if log_sums_at_least is None else log_sums_at_least.contiguous().numpy()
-    _kernel_tree.lead_to_targets(
-        held, targets, queries.numpy(), at_least, log_sum, offsets.numpy(), torch.get_num_threads()
-    )
-    return offsets
-
-
-# The same as operators, as which compiled graphs call the extension.
-
-
-@torch.library.custom_op("lerobot_pf2mp::sum_kernels", mutates_args=(), device_types="cpu")
-def sum_kernels(
+@torch.library.custom_op("lerobot_pf2mp::kernel_sums", mutates_args=(), device_types="cpu")
+def _sums_operator(
     leaves: Tensor, boxes: Tensor, centre: Tensor, scale: float, reach: float, queries: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """What `KernelTree.sums` returns."""
-    return _sums(_hold(leaves, boxes, centre, scale, reach), queries)
+    return KernelTree(leaves, boxes, centre, scale, reach).sums(queries)
 
 
-@sum_kernels.register_fake
+@_sums_operator.register_fake
 def _(
     leaves: Tensor, boxes: Tensor, centre: Tensor, scale: float, reach: float, queries: Tensor
 ) -> tuple[Tensor, Tensor]:
     return queries.new_empty(queries.shape), queries.new_empty(len(queries))
 
 
-@torch.library.custom_op("lerobot_pf2mp::lead_to_targets", mutates_args=(), device_types="cpu")
-def lead_to_targets(
+@torch.library.custom_op("lerobot_pf2mp::offsets_to_targets", mutates_args=(), device_types="cpu")
+def _offsets_operator(
     leaves: Tensor,
     boxes: Tensor,
     centre: Tensor,
@@ -171,19 +172,41 @@ def lead_to_targets(
     target_leaves: Tensor,
     target_boxes: Tensor,
     target_centre: Tensor,
+    target_scale: float,
+    target_reach: float,
     queries: Tensor,
     log_sum: float,
-    log_sums_at_least: Tensor | None,
 ) -> Tensor:
-    """What `KernelTree.offsets_to` returns."""
-    held = _hold(leaves, boxes, centre, scale, reach)
-    targets = _hold(target_leaves, target_boxes, target_centre, scale, reach)
-    return _offsets_to(held, targets, queries, log_sum, log_sums_at_least)
+    targets = KernelTree(target_leaves, target_boxes, target_centre, target_scale, target_reach)
+    return KernelTree(leaves, boxes, centre, scale, reach).offsets_to(targets, queries, log_sum)
 
 
-@lead_to_targets.register_fake
-def _(*tensors_and_numbers: Tensor | float | None) -> Tensor:
-    queries = tensors_and_numbers[8]
+@torch.library.custom_op("lerobot_pf2mp::steps_to_targets", mutates_args=(), device_types="cpu")
+def _steps_operator(
+    leaves: Tensor,
+    boxes: Tensor,
+    centre: Tensor,
+    scale: float,
+    reach: float,
+    target_leaves: Tensor,
+    target_boxes: Tensor,
+    target_centre: Tensor,
+    target_scale: float,
+    target_reach: float,
+    queries: Tensor,
+    log_sum: float,
+    share: float,
+    step_reach: float,
+) -> Tensor:
+    targets = KernelTree(target_leaves, target_boxes, target_centre, target_scale, target_reach)
+    tree = KernelTree(leaves, boxes, centre, scale, reach)
+    return tree.steps_to(targets, queries, log_sum, share, step_reach)
+
+
+@_offsets_operator.register_fake
+@_steps_operator.register_fake
+def _(*arguments: Tensor | float) -> Tensor:
+    queries = arguments[10]
     assert isinstance(queries, Tensor)
     return queries.new_empty(queries.shape)
 

@@ -26,6 +26,8 @@ from lerobot_pf2mp.kernel_density import PAIRS_PER_BLOCK, check_bandwidth, log_k
 from lerobot_pf2mp.kernel_sums import KernelSums
 from lerobot_pf2mp.kernel_tree import KernelTree
 
+_TINY = torch.finfo(torch.float32).tiny
+
 
 @dataclass(frozen=True, eq=False)
 class PotentialField:
@@ -131,7 +133,7 @@ class PotentialField:
         return self.mean_shift(a) / self.bandwidth**2
 
     @torch.no_grad()
-    def offset_to_safe_set(self, a: Tensor, log_density_at_least: Tensor | None = None) -> Tensor:
+    def offset_to_safe_set(self, a: Tensor) -> Tensor:
         """The vector from a to the safe set H; zero inside H.
 
         The paper does not say how d(a, H) is measured. Outside H this is the vector to the nearest anchor that lies
@@ -139,24 +141,41 @@ class PotentialField:
 
         Args:
             a: ``(..., D)`` actions [normalised].
-            log_density_at_least: ``(...)`` a lower bound of their log densities, where one is known; it spares looking at
-                actions that it shows to be safe.
 
         Returns:
             ``(..., D)`` offsets [normalised]; d(a, H) is their norm.
         """
         queries = self._flatten(a)
         if self._sums.has_tree:
-            at_least = None
-            if log_density_at_least is not None:
-                at_least = log_density_at_least.reshape(-1) + self._log_normaliser
-            log_sum = self.log_threshold + self._log_normaliser
-            offsets = self._sums.tree.offsets_to(self._safe_tree, queries, log_sum, at_least)
+            offsets = self._sums.tree.offsets_to(self._safe_tree, queries, self._log_sum_threshold)
         else:
             # Without a look at the values, for which a GPU would have to be waited for.
             is_unsafe = self.log_density(queries) <= self.log_threshold
             offsets = torch.where(is_unsafe.unsqueeze(-1), self._offset_to_safe_anchor(queries), 0.0)
         return offsets.reshape(a.shape)
+
+    @torch.no_grad()
+    def step_to_safety(self, a: Tensor, share: float, reach: float) -> Tensor:
+        """The step that takes an action towards its local mean, and on from there towards the safe set H.
+
+        Args:
+            a: ``(..., D)`` actions [normalised].
+            share: In [0, 1], how much of the way to the local mean.
+            reach: How far at most towards H [normalised].
+
+        Returns:
+            ``(..., D)`` steps [normalised].
+        """
+        queries = self._flatten(a)
+        if self._sums.has_tree:
+            tree, log_sum = self._sums.tree, self._log_sum_threshold
+            steps = tree.steps_to(self._safe_tree, queries, log_sum, share, reach)
+        else:
+            steps = share * self.mean_shift(queries)
+            offset = self.offset_to_safe_set(queries + steps)
+            distance = offset.norm(dim=-1, keepdim=True).clamp_min(max(reach, _TINY))
+            steps = steps.addcdiv_(offset, distance, value=reach)
+        return steps.reshape(a.shape)
 
     def potential(self, a: Tensor) -> Tensor:
         """The potential phi(a) = log p(a) + alpha d(a, H); larger is safer.
@@ -184,7 +203,7 @@ class PotentialField:
         gradient = self.score(a)
         if self.alpha != 0:
             offset = self.offset_to_safe_set(a)
-            direction = offset / offset.norm(dim=-1, keepdim=True).clamp_min(torch.finfo(torch.float32).tiny)
+            direction = offset / offset.norm(dim=-1, keepdim=True).clamp_min(_TINY)
             gradient = gradient - self.alpha * direction
         return gradient
 
@@ -196,6 +215,10 @@ class PotentialField:
     def _log_normaliser(self) -> float:
         count, dim = self.anchors.shape
         return math.log(count) + dim * (math.log(self.bandwidth) + 0.5 * math.log(2 * math.pi))
+
+    @property
+    def _log_sum_threshold(self) -> float:
+        return self.log_threshold + self._log_normaliser
 
     @cached_property
     def _anchor_is_safe(self) -> Tensor:

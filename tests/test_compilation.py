@@ -104,9 +104,7 @@ def test_the_steps_of_a_guided_policy_are_one_graph(sums: str) -> None:
     guide = policy.make_guide(batch)
     compiled = torch.compile(policy.predict_action_chunk, backend="eager", fullgraph=True)
     chunk = compiled({STATE: batch[STATE]}, noise=noise, guide=guide)
-    torch.testing.assert_close(
-        chunk, policy.predict_action_chunk(batch, noise=noise), rtol=1e-4, atol=1e-5
-    )
+    torch.testing.assert_close(chunk, policy.predict_action_chunk(batch, noise=noise), rtol=1e-4, atol=1e-5)
 
 
 def test_a_compiled_policy_watches_its_plans() -> None:
@@ -137,18 +135,22 @@ def test_a_compiled_field_is_the_same(sums: str) -> None:
     field = fit(points, threshold_quantile=0.2, alpha=-1.0).prepared
     a = points[:200] + 5 * field.bandwidth * torch.randn(200, 2)
     assert (field.offset_to_safe_set(a) != 0).any()
-    for name in ("log_density", "score", "offset_to_safe_set", "potential", "potential_gradient"):
-        lookup = getattr(PotentialField, name)
-        found = torch.compile(lookup, backend="eager", fullgraph=True)(field, a)
-        torch.testing.assert_close(found, lookup(field, a), rtol=1e-4, atol=1e-4)
+    for lookup, arguments in (
+        (PotentialField.log_density, ()),
+        (PotentialField.score, ()),
+        (PotentialField.offset_to_safe_set, ()),
+        (PotentialField.potential_gradient, ()),
+        (PotentialField.step_to_safety, (0.5, 0.1)),
+    ):
+        found = torch.compile(lookup, backend="eager", fullgraph=True)(field, a, *arguments)
+        torch.testing.assert_close(found, lookup(field, a, *arguments), rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.skipif(not kernel_tree.is_available(), reason="the C extension could not be built")
-@pytest.mark.parametrize("has_bound", [True, False])
-def test_the_extension_is_an_operator(has_bound: bool) -> None:
-    tree = KernelSums(paths(300, 2), 0.05).tree
-    held = (tree.leaves, tree.boxes, tree.centre, tree.scale, tree.reach)
+def test_the_extensions_operators_are_proper_ones() -> None:
+    parts = KernelSums(paths(300, 2), 0.05).tree._parts
+    targets = KernelSums(paths(100, 2), 0.05).tree._parts
     queries = paths(50, 2, seed=1)
-    torch.library.opcheck(kernel_tree.sum_kernels, (*held, queries))
-    bound = torch.rand(50) if has_bound else None
-    torch.library.opcheck(kernel_tree.lead_to_targets, (*held, *held[:3], queries, 0.5, bound))
+    torch.library.opcheck(kernel_tree._sums_operator, (*parts, queries))
+    torch.library.opcheck(kernel_tree._offsets_operator, (*parts, *targets, queries, 0.5))
+    torch.library.opcheck(kernel_tree._steps_operator, (*parts, *targets, queries, 0.5, 0.3, 0.1))

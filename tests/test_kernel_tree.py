@@ -95,19 +95,32 @@ def test_the_way_to_the_nearest_target_is_that_of_all_distances(dim: int, n_thre
     distances = torch.cdist(queries.double(), targets.double(), compute_mode="donot_use_mm_for_euclid_dist")
     wanted = (targets[distances.argmin(dim=1)] - queries) * (log_sums <= log_sum).unsqueeze(1)
     with threads(n_threads):
-        for at_least in (None, log_sums.float() - 1e-3 - torch.rand(1500)):
-            found = sums.tree.offsets_to(KernelTree.of(targets, 0.05), queries, log_sum, at_least)
-            is_clear = (log_sums - log_sum).abs() > 1e-4
-            torch.testing.assert_close(found[is_clear], wanted[is_clear], rtol=1e-5, atol=1e-4)
-            assert (found != 0).any()
+        found = sums.tree.offsets_to(KernelTree.of(targets, 0.05), queries, log_sum)
+    is_clear = (log_sums - log_sum).abs() > 1e-4
+    torch.testing.assert_close(found[is_clear], wanted[is_clear], rtol=1e-5, atol=1e-4)
+    assert (found != 0).any()
 
 
-def test_what_is_known_to_be_dense_is_not_looked_at() -> None:
-    sums = KernelSums(paths(500, 2), 0.05)
-    queries = torch.full((10, 2), 5.0)
-    at_least = torch.tensor([0.0, 2.0]).repeat(5)
-    found = sums.tree.offsets_to(sums.tree, queries, 1.0, at_least)
-    assert torch.equal((found != 0).any(dim=1), at_least == 0)
+@pytest.mark.parametrize("n_threads", [1, 2])
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("reach", [0.0, 0.01, 10.0])
+def test_a_step_is_a_share_of_the_way_to_the_mean_and_the_reach_to_a_target(
+    reach: float, share: float, n_threads: int
+) -> None:
+    sums = KernelSums(paths(3000, 3), 0.05)
+    queries = sums.anchors[::2] + 0.1 * torch.randn(1500, 3)
+    targets = KernelTree.of(sums.anchors[:300], 0.05)
+    shifts = share * sums(queries)[0]
+    log_sums = sums(queries + shifts)[1]
+    log_sum = log_sums.median().item()
+    ways = sums.tree.offsets_to(targets, queries + shifts, log_sum)
+    lengths = ways.norm(dim=1, keepdim=True)
+    wanted = shifts + ways * (reach / lengths.clamp_min(max(reach, 1e-9)))
+    with threads(n_threads):
+        found = sums.tree.steps_to(targets, queries, log_sum, share, reach)
+    is_clear = (log_sums - log_sum).abs() > 1e-4
+    torch.testing.assert_close(found[is_clear], wanted[is_clear], rtol=1e-4, atol=1e-5)
+    assert 300 < (lengths > 0).sum() < 1200
 
 
 @pytest.mark.parametrize("far", [1e6, 3e38, torch.nan])
@@ -115,10 +128,13 @@ def test_ways_end_somewhere(far: float) -> None:
     queries = torch.tensor([[far, 0.0], [0.0, -far], [5.0, 5.0]])
     anchors = paths(300, 2)
     sums = KernelSums(anchors, 0.05)
-    found = sums.tree.offsets_to(sums.tree, queries, 0.0)
-    assert torch.isfinite(found[:2]).all() or not math.isfinite(far)
-    nearest = (queries[2] - anchors).square().sum(dim=1).argmin()
-    torch.testing.assert_close(queries[2] + found[2], anchors[nearest])
+    nearest = anchors[(queries[2] - anchors).square().sum(dim=1).argmin()]
+    for found in (
+        sums.tree.offsets_to(sums.tree, queries, 0.0),
+        sums.tree.steps_to(sums.tree, queries, 0.0, 0.5, 10.0),
+    ):
+        assert torch.isfinite(found[:2]).all() or not math.isfinite(far)
+        torch.testing.assert_close(queries[2] + found[2], nearest, rtol=1e-3, atol=1e-3)
 
 
 def test_the_extension_refuses_arrays_that_do_not_fit() -> None:
@@ -135,7 +151,9 @@ def test_the_extension_refuses_arrays_that_do_not_fit() -> None:
         with pytest.raises(ValueError, match="do not fit"):
             kernel_tree._kernel_tree.sum_kernels(tree, queries, queries.copy(), log_sums, 1)
         with pytest.raises(ValueError, match="do not fit"):
-            kernel_tree._kernel_tree.lead_to_targets(held, tree, queries, None, 0.0, queries.copy(), 1)
+            kernel_tree._kernel_tree.lead_to_targets(held, tree, queries, 0.0, queries.copy(), 1)
+        with pytest.raises(ValueError, match="do not fit"):
+            kernel_tree._kernel_tree.step_to_targets(tree, held, queries, 0.0, 0.5, 0.1, queries.copy(), 1)
     for offsets, sums in (
         (queries[1:], log_sums),
         (queries, log_sums[1:]),
@@ -144,7 +162,7 @@ def test_the_extension_refuses_arrays_that_do_not_fit() -> None:
         with pytest.raises(ValueError, match="do not fit"):
             kernel_tree._kernel_tree.sum_kernels(held, queries, offsets.copy(), sums.copy(), 1)
     with pytest.raises(ValueError, match="do not fit"):
-        kernel_tree._kernel_tree.lead_to_targets(held, held, queries, log_sums[1:], 0.0, queries.copy(), 1)
+        kernel_tree._kernel_tree.lead_to_targets(held, held, queries, 0.0, queries[1:].copy(), 1)
     with pytest.raises(ValueError, match="do not fit"):
         kernel_tree._kernel_tree.order_points(queries, np.zeros(3, np.int64))
     with pytest.raises(TypeError, match="bytes-like"):  # not contiguous

@@ -459,12 +459,34 @@ def test_the_blocks_do_not_change_the_result(monkeypatch):
         torch.testing.assert_close(result, wanted, rtol=1e-5, atol=1e-5)
 
 
-def test_a_known_bound_of_the_density_changes_no_offset():
+@pytest.mark.parametrize("has_extension", [True, False])
+@pytest.mark.parametrize(("share", "reach"), [(0.0, 0.05), (0.4, 0.05), (1.0, 100.0)])
+def test_a_step_to_safety_is_part_of_the_mean_shift_and_then_of_the_way_to_the_safe_set(
+    share, reach, has_extension, monkeypatch
+):
+    if not has_extension:
+        monkeypatch.setattr("lerobot_pf2mp.kernel_tree._kernel_tree", None)
     points = clusters(500, 2)
     field = fit(points, threshold_quantile=0.2)
+    a = (points + 3 * field.bandwidth * torch.randn_like(points)).reshape(50, 10, 2)
+    shift = share * field.mean_shift(a)
+    offset = field.offset_to_safe_set(a + shift)
+    length = offset.norm(dim=-1, keepdim=True)
+    wanted = shift + offset * (reach / length.clamp_min(reach))
+    torch.testing.assert_close(field.step_to_safety(a, share, reach), wanted, rtol=1e-5, atol=1e-5)
+    assert (length > 0).any() and (length == 0).any()
+
+
+def test_a_mean_shift_raises_the_density_by_at_least_its_square():
+    # Comaniciu and Meer 2002, Theorem 1, by which the extension knows actions to be safe.
+    points = clusters(500, 2)
+    field = fit(points)
     a = points + 3 * field.bandwidth * torch.randn_like(points)
-    bound = field.log_density(a) - torch.rand(len(a))
-    assert torch.equal(field.offset_to_safe_set(a, bound), field.offset_to_safe_set(a))
+    before, shift = field.log_density_and_mean_shift(a)
+    for share in (0.1, 0.5, 1.0):
+        gain = share * (2 - share) / (2 * field.bandwidth**2) * shift.square().sum(dim=1)
+        assert (field.log_density(a + share * shift) >= before + gain - 1e-4).all()
+        assert (field.log_density(a + share * shift) <= before + gain + 10).any()
 
 
 def test_offsets_without_a_look_at_the_values_are_the_same(monkeypatch):
