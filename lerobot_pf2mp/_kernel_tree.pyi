@@ -17,15 +17,21 @@ def sum_kernels(tree: Tree, queries: NDArray, offsets: NDArray, log_sums: NDArra
     """Fills `offsets` ``(Q, D)`` to the local means and `log_sums` ``(Q,)`` of the kernels at queries ``(Q, D)``."""
 
 def lead_to_targets(
+    tree: Tree, targets: Tree, queries: NDArray, threshold: float, offsets: NDArray, n_threads: int
+) -> None:
+    """Fills `offsets` ``(Q, D)``: to the nearest target where the log sum is not above the threshold, elsewhere 0."""
+
+def step_to_targets(
     tree: Tree,
     targets: Tree,
     queries: NDArray,
-    at_least: NDArray | None,
     threshold: float,
-    offsets: NDArray,
+    share: float,
+    reach: float,
+    steps: NDArray,
     n_threads: int,
 ) -> None:
-    """Fills `offsets` ``(Q, D)``, to the nearest target, of queries whose log sum is not above the threshold.
+    """Fills `steps` ``(Q, D)``: a share of the way to the local mean, and from there at most `reach` to the nearest target.
 
-    Those of the others stay as they are. `at_least` ``(Q,)`` are lower bounds of the log sums, where known.
+    The second part is where the log sum there is not above the threshold.
     """

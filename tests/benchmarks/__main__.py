@@ -17,7 +17,16 @@ from tqdm import tqdm
 
 from lerobot_pf2mp.plots.theme import THEMES
 
-PARTS = ("guidance", "density", "chunk", "training", "conversion", "evaluation", "startup")
+PARTS = (
+    "guidance",
+    "density",
+    "chunk",
+    "training",
+    "time_to_policy",
+    "conversion",
+    "evaluation",
+    "startup",
+)
 
 
 @dataclass
@@ -29,8 +38,8 @@ class BenchConfig:
         python tests/benchmarks --only=[density,guidance] --output_dir=bench
     """
 
-    # Which parts: guidance, density, chunk, training, conversion, evaluation, startup. All of them take an hour on two
-    # cores.
+    # Which parts: guidance, density, chunk, training, time_to_policy, conversion, evaluation, startup. All of them take an
+    # hour and a half on two cores.
     only: list[str] = field(default_factory=lambda: list(PARTS))
     # Folder of bench.csv, table.md and run.json; by default results/bench. Parts measured there before stay, unless they are
     # measured again.

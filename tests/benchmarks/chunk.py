@@ -1,19 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long a chunk takes beside LeRobot's diffusion policy, with the same U-Net, on the same observation.
+"""How long a chunk takes beside LeRobot's own policies on the same observation: diffusion and multi_task_dit.
 
-LeRobot's small flow matching policy, multi_task_dit, has no row: it cannot be made without CLIP's text encoder, whose
-weights are on the Hub, and without the package transformers.
+Diffusion has the same U-Net. LeRobot's small flow matching policy, multi_task_dit, has a transformer instead, here with its
+default options, and CLIP's text encoder, here with random weights, on which the time does not depend. It needs the package
+transformers, and has no row where that is not installed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from statistics import median
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from harness import Row, ratio, threads, time_in_turns
-from maze_policies import NAMES, PAPER, SMALL, make_planner
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.policies.multi_task_dit.configuration_multi_task_dit import MultiTaskDiTConfig
+from lerobot.policies.multi_task_dit.modeling_multi_task_dit import MultiTaskDiTPolicy
+from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
+from lerobot.utils.import_utils import is_package_available
+from maze_policies import HORIZON, NAMES, PAPER, SMALL, make_planner
 
 N_ROUNDS = 15
 MIN_SECONDS = 0.1
@@ -25,6 +32,8 @@ POLICIES: dict[str, tuple[str, dict[str, Any]]] = {
     "DDIM, 10 steps": ("diffusion", {"num_inference_steps": 10}),
     "DDPM, 100 steps": ("diffusion", {"num_inference_steps": 100, "noise_scheduler_type": "DDPM"}),
 }
+DIT_STEPS = (5, 100)  # 100 are its default
+N_TOKENS = 77  # of CLIP's texts
 
 
 def measure() -> Iterator[Row]:
@@ -37,10 +46,16 @@ def measure() -> Iterator[Row]:
 
 def _measure_on(device: str, down_dims: tuple[int, ...]) -> Iterator[Row]:
     case = f"{NAMES[down_dims]}, batch 1"
-    calls = {
+    calls: dict[str, Callable[[], torch.Tensor]] = {
         name: make_planner(kind, down_dims, 1, device, **options)
         for name, (kind, options) in POLICIES.items()
     }
+    transformers = {}
+    if is_package_available("transformers"):
+        transformers = {
+            f"multi_task_dit, {n_steps} steps": _make_multi_task_dit(n_steps, device) for n_steps in DIT_STEPS
+        }
+    calls |= transformers
     for n_threads in CPU_THREADS if device == "cpu" else (0,):
         with threads(n_threads or 1), torch.inference_mode():
             times = time_in_turns(calls, N_ROUNDS, MIN_SECONDS)
@@ -49,6 +64,37 @@ def _measure_on(device: str, down_dims: tuple[int, ...]) -> Iterator[Row]:
         yield _compare(times, case, n_threads, "DDPM, 100 steps", "pf2mp, 5 steps", target=15, at_least=True)
         yield _compare(times, case, n_threads, "pf2mp, 5 steps", "DDIM, 5 steps", target=1)
         yield _compare(times, case, n_threads, "pf2mp, 10 steps", "DDIM, 10 steps", target=1)
+        for name in transformers:
+            yield _compare(times, case, n_threads, name, "pf2mp, 5 steps")
+
+
+def _make_multi_task_dit(n_steps: int, device: str) -> Callable[[], torch.Tensor]:
+    """Plans one chunk with LeRobot's multi_task_dit, which observes start and goal as one state."""
+    from transformers import (
+        CLIPTextConfig,
+        CLIPTextModel,
+    )  # its defaults are the text encoder that the policy asks for
+
+    config = MultiTaskDiTConfig(
+        device=device,
+        push_to_hub=False,
+        objective="flow_matching",
+        num_integration_steps=n_steps,
+        n_obs_steps=1,
+        horizon=HORIZON,
+        n_action_steps=HORIZON,
+        input_features={OBS_STATE: PolicyFeature(FeatureType.STATE, (4,))},
+        output_features={ACTION: PolicyFeature(FeatureType.ACTION, (2,))},
+    )
+    torch.manual_seed(0)
+    with patch.object(CLIPTextModel, "from_pretrained", lambda _: CLIPTextModel(CLIPTextConfig())):
+        policy = MultiTaskDiTPolicy(config).to(device).eval()
+    batch = {
+        OBS_STATE: torch.zeros(1, 1, 4, device=device),
+        OBS_LANGUAGE_TOKENS: torch.arange(N_TOKENS, device=device)[None],
+        OBS_LANGUAGE_ATTENTION_MASK: torch.ones(1, N_TOKENS, dtype=torch.bool, device=device),
+    }
+    return lambda: policy.predict_action_chunk(dict(batch))
 
 
 def _compare(
@@ -57,7 +103,7 @@ def _compare(
     n_threads: int,
     name: str,
     to: str,
-    target: float,
+    target: float | None = None,
     at_least: bool = False,
 ) -> Row:
     value = ratio(times, name, to)

@@ -30,9 +30,12 @@ N_QUERIES = (80, 10_000, 1_000_000)
 PAPER = (2, 3_000, 80)  # the field of a maze, and one chunk
 
 LARGEST_ERROR = 1e-4  # relative; what errs more does not count as exact
-SECONDS, OUR_SECONDS = 3.0, 10.0  # what would take longer for one call is left out
+SECONDS = 0.6  # a call that would take longer is timed with fewer queries, in proportion to which the time then grows
+TOO_LONG = 1.5  # what takes longer with the fewest queries has no turns
+N_TRIED = (80, 1_000, 10_000, 100_000, 1_000_000)
 PAIRS_PER_BLOCK = 2**24  # of the peers that hold all pairs of a block
-N_CHECKED = 200
+N_CHECKED = 80
+N_ROUNDS = 5
 
 type Density = Callable[[torch.Tensor], tuple[torch.Tensor | None, torch.Tensor | None]]
 
@@ -93,44 +96,55 @@ def _measure_cell(case: Case, n_threads: int) -> Iterator[Row]:
     ) -> Row:
         return Row(PART, str(case), quantity, value, unit, n_threads, target, at_least)
 
-    few = case.queries[:10_000]  # from which the time is predicted
+    n_queries = len(case.queries)
     wanted = _in_double(Case(case.anchors, case.queries[:N_CHECKED], case.bandwidth))
-    exact: dict[str, Density] = {}
+    timed: dict[str, tuple[Density, int]] = {}
     for name, make in PEERS.items():
         density = make(case)
         if density is None:
             continue
         error = _error(density(case.queries[:N_CHECKED]), wanted)
-        is_ours = name == OURS
-        if is_ours:
+        if name == OURS:
             yield row("error of the score", error, "relative", LARGEST_ERROR)
         elif error > LARGEST_ERROR:
             yield row(f"error of {name}, left out", error, "relative")
             continue
-        n_tried = len(few) if is_ours else PAPER[2]
-        seconds = (
-            _seconds(partial(density, few[:n_tried]), n_warm_up=0)
-            * len(case.queries)
-            / min(n_tried, len(case.queries))
-        )
-        if seconds > (OUR_SECONDS if is_ours else SECONDS):
-            yield row(f"{name}, predicted from {n_tried} queries", seconds, "s")
-            if is_ours:
-                return
-            continue
-        exact[name] = density
-    n_rounds = 3 if len(case.anchors) * len(case.queries) > 1e8 else 9
-    times = time_in_turns({name: partial(density, case.queries) for name, density in exact.items()}, n_rounds)
+        n_timed, seconds = _queries_within(SECONDS, density, case)
+        if seconds > TOO_LONG:
+            yield row(f"{name}, {_from(n_timed)}, once", 1000 * seconds * n_queries / n_timed, "ms")
+        else:
+            timed[name] = density, n_timed
+    calls = {name: partial(density, case.queries[:n]) for name, (density, n) in timed.items()}
+    times = {
+        name: [x * n_queries / timed[name][1] for x in seconds]
+        for name, seconds in time_in_turns(calls, N_ROUNDS).items()
+    }
     for name, seconds in times.items():
-        yield row(name, 1000 * median(seconds), "ms")
+        n_timed = timed[name][1]
+        quantity = name if n_timed == n_queries else f"{name}, {_from(n_timed)}"
+        yield row(quantity, 1000 * median(seconds), "ms")
     peers = [name for name in times if name != OURS]
     if peers:
         fastest = min(peers, key=lambda name: median(times[name]))
         yield row(f"{OURS} / {fastest}, the fastest exact peer", ratio(times, OURS, fastest), "x", 1.1)
-    if (case.anchors.shape[1], len(case.anchors), len(case.queries)) == PAPER:
+    if (case.anchors.shape[1], len(case.anchors), n_queries) == PAPER:
         for name in ("scikit-learn", "torch-kde"):
             if name in times:
                 yield row(f"{name} / {OURS}", ratio(times, name, OURS), "x", 10.0, at_least=True)
+
+
+def _queries_within(seconds: float, density: Density, case: Case) -> tuple[int, float]:
+    """How many of the queries a call can have in that time, but 80 at least, and how long it took with the last that were tried."""
+    sizes = [n for n in N_TRIED if n <= len(case.queries)]
+    for n, larger in zip(sizes, [*sizes[1:], None], strict=True):
+        taken = _seconds(partial(density, case.queries[:n]), n_warm_up=0)
+        if larger is None or taken * larger / n > seconds:
+            return n, taken
+    raise AssertionError  # the last size has no larger one
+
+
+def _from(n_queries: int) -> str:
+    return f"from {n_queries:.0e} queries".replace("e+0", "e")
 
 
 def _measure_growth() -> Iterator[Row]:
@@ -150,12 +164,12 @@ def _measure_growth() -> Iterator[Row]:
                         median(_seconds(partial(density, case.queries), n_warm_up=0) for _ in range(3))
                     )
                 swept = [size[what == "queries"] for size in sizes]
-                label = f"D = {dim}, {min(swept):.0e} to {max(swept):.0e} {what}".replace("e+0", "e")
-                yield Row(PART, label, "exponent of time", growth_exponent(swept, seconds), "")
+                value = growth_exponent(swept, seconds)
+                yield Row(PART, f"D = {dim}, {_range(swept)} {what}", "exponent of time", value, "")
 
 
 def _measure_memory() -> Iterator[Row]:
-    """How far the peak of memory is above what was held before a call; where Linux and glibc help."""
+    """How far the peak of memory is above what was held before the field was made; where Linux and glibc help."""
     if platform.libc_ver()[0] != "glibc":
         return
     code = """
@@ -164,25 +178,33 @@ from pathlib import Path
 sys.path.insert(0, sys.argv[3])
 from density import _ours, make_case
 def held(what): return int(Path("/proc/self/status").read_text().split(what + ":")[1].split()[0]) / 1024  # [MB]
+small = make_case(3, 300, 100)
+_ours(small)(small.queries)
 case = make_case(3, int(sys.argv[1]), int(sys.argv[2]))
-density = _ours(case)
-density(case.queries[:100])
 ctypes.CDLL(None).malloc_trim(0)  # gives free memory back, in which the call would find room
 Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
 before = held("VmRSS")
-density(case.queries)
+_ours(case)(case.queries)
 print(held("VmHWM") - before)
 """
-    sizes = [(n, n) for n in (30_000, 100_000, 300_000)]
-    used = []
-    for n_anchors, n_queries in sizes:
-        command = [sys.executable, "-c", code, str(n_anchors), str(n_queries), sys.path[0]]
-        used.append(float(subprocess.run(command, capture_output=True, text=True, check=True).stdout))
-        pairs = n_anchors * n_queries * 4 / 2**20
-        label = f"D = 3, {n_anchors} anchors and queries"
-        yield Row(PART, label, f"memory of one call (all pairs: {pairs:,.0f} MB)", used[-1], "MB")
-    exponent = growth_exponent([n for n, _ in sizes], used)
-    yield Row(PART, "D = 3, 3e4 to 3e5 anchors and queries", "exponent of memory", exponent, "", target=1.2)
+    for what, sizes in (
+        ("anchors", [(n, 1_000) for n in (100_000, 300_000, 1_000_000)]),
+        ("queries", [(3_000, n) for n in (100_000, 300_000, 1_000_000)]),
+    ):
+        used = []
+        for n_anchors, n_queries in sizes:
+            command = [sys.executable, "-c", code, str(n_anchors), str(n_queries), sys.path[0]]
+            used.append(float(subprocess.run(command, capture_output=True, text=True, check=True).stdout))
+            pairs = n_anchors * n_queries * 4 / 2**20
+            label = f"D = 3, {n_anchors:.0e} anchors, {n_queries:.0e} queries".replace("e+0", "e")
+            yield Row(PART, label, f"memory of field and call (all pairs: {pairs:,.0f} MB)", used[-1], "MB")
+        swept = [size[what == "queries"] for size in sizes]
+        value = growth_exponent(swept, used)
+        yield Row(PART, f"D = 3, {_range(swept)} {what}", "exponent of memory", value, "", target=1.2)
+
+
+def _range(sizes: list[int]) -> str:
+    return f"{min(sizes):.0e} to {max(sizes):.0e}".replace("e+0", "e")
 
 
 def _ours(case: Case) -> Density:

@@ -37,14 +37,9 @@ def plot_density(output: Path, rows: Sequence[Row], background: str = "light") -
     lines: dict[int, dict[str, list[tuple[float, float]]]] = defaultdict(lambda: defaultdict(list))
     for row in rows:
         found = _CASE.fullmatch(row.case)
-        if (
-            found
-            and row.threads == 1
-            and found[3] == N_QUERIES
-            and row.quantity in _STYLES
-            and row.unit == "ms"
-        ):
-            lines[int(found[1])][row.quantity].append((float(found[2]), row.value))
+        name = row.quantity.split(", from ")[0]
+        if found and row.threads == 1 and found[3] == N_QUERIES and name in _STYLES and row.unit == "ms":
+            lines[int(found[1])][name].append((float(found[2]), row.value))
     with themed_figure(output, theme, (WIDTH, 3.6), layout="constrained") as figure:
         axes = figure.subplots(1, len(lines), sharey=True)
         for axis, (dim, by_name) in zip(axes, sorted(lines.items()), strict=True):

@@ -21,6 +21,7 @@ PACKAGES = (
     "torch",
     "lerobot",
     "diffusers",
+    "transformers",
     "numpy",
     "scipy",
     "scikit-learn",
