@@ -134,7 +134,7 @@ def _measure_cell(case: Case, n_threads: int) -> Iterator[Row]:
 
 
 def _queries_within(seconds: float, density: Density, case: Case) -> tuple[int, float]:
-    """How many of the queries a call can have in that time, but 80 at least, and how long it took with the last that were tried."""
+    """How many of the queries a call can have in that time, at least the fewest, and how long it then took [s]."""
     sizes = [n for n in N_TRIED if n <= len(case.queries)]
     for n, larger in zip(sizes, [*sizes[1:], None], strict=True):
         taken = _seconds(partial(density, case.queries[:n]), n_warm_up=0)
