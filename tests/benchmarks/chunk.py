@@ -20,7 +20,7 @@ from lerobot.policies.multi_task_dit.configuration_multi_task_dit import MultiTa
 from lerobot.policies.multi_task_dit.modeling_multi_task_dit import MultiTaskDiTPolicy
 from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
 from lerobot.utils.import_utils import is_package_available
-from maze_policies import HORIZON, NAMES, PAPER, SMALL, make_planner
+from maze_policies import HORIZON, NAMES, PAPER, SMALL, Planner, make_planner
 
 N_ROUNDS = 15
 MIN_SECONDS = 0.1
@@ -56,6 +56,9 @@ def _measure_on(device: str, down_dims: tuple[int, ...]) -> Iterator[Row]:
             f"multi_task_dit, {n_steps} steps": _make_multi_task_dit(n_steps, device) for n_steps in DIT_STEPS
         }
     calls |= transformers
+    plain, compiled = "pf2mp, 5 steps", "pf2mp, 5 steps, compiled"
+    if down_dims == SMALL:  # the other one's outputs are replaced, at which a graph would end
+        calls[compiled] = _compile(make_planner("pf2mp", SMALL, 1, device, num_inference_steps=5))
     for n_threads in CPU_THREADS if device == "cpu" else (0,):
         with threads(n_threads or 1), torch.inference_mode():
             times = time_in_turns(calls, N_ROUNDS, MIN_SECONDS)
@@ -65,7 +68,15 @@ def _measure_on(device: str, down_dims: tuple[int, ...]) -> Iterator[Row]:
         yield _compare(times, case, n_threads, "pf2mp, 5 steps", "DDIM, 5 steps", target=1)
         yield _compare(times, case, n_threads, "pf2mp, 10 steps", "DDIM, 10 steps", target=1)
         for name in transformers:
-            yield _compare(times, case, n_threads, name, "pf2mp, 5 steps")
+            yield _compare(times, case, n_threads, name, plain)
+        if compiled in calls:
+            yield _compare(times, case, n_threads, compiled, plain)
+
+
+def _compile(planner: Planner) -> Callable[[], torch.Tensor]:
+    """The same as ``lerobot-rollout --use_torch_compile=true`` makes it, which takes a minute at the first chunk."""
+    planner.policy.predict_action_chunk = torch.compile(planner.policy.predict_action_chunk)
+    return planner
 
 
 def _make_multi_task_dit(n_steps: int, device: str) -> Callable[[], torch.Tensor]:
