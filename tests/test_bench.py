@@ -6,10 +6,12 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 
 ROOT = Path(__file__).parents[1]
 sys.path.append(str(ROOT / "tests" / "benchmarks"))
 
+import density  # noqa: E402
 from harness import Row, growth_exponent, ratio, time_in_turns  # noqa: E402
 from report import make_overview, make_table, read_rows, write_report  # noqa: E402
 
@@ -38,6 +40,17 @@ def test_a_turn_repeats_a_fast_call() -> None:
 
 def test_the_exponent_is_that_of_the_power_law() -> None:
     assert growth_exponent([1, 10, 100], [3, 3 * 10**1.5, 3 * 10**3]) == pytest.approx(1.5)
+
+
+@pytest.mark.parametrize(("n_queries", "enough"), [(80, 1.0), (10_000, 1.0), (1_000_000, 0.06)])
+def test_a_slow_density_is_timed_with_as_many_queries_as_there_is_time_for(
+    n_queries: int, enough: float
+) -> None:
+    case = density.Case(torch.zeros(3, 2), torch.zeros(n_queries, 2), 0.1)
+    wanted = n_queries if enough == 1.0 else 1000
+    n, seconds = density._queries_within(enough, lambda queries: time.sleep(len(queries) * 1e-5), case)
+    assert n == wanted
+    assert 1e-5 * n <= seconds < 1e-5 * n + 0.05
 
 
 @pytest.mark.parametrize(

@@ -101,11 +101,16 @@ def _make_multi_task_dit(n_steps: int, device: str) -> Callable[[], torch.Tensor
     with patch.object(CLIPTextModel, "from_pretrained", lambda _: CLIPTextModel(CLIPTextConfig())):
         policy = MultiTaskDiTPolicy(config).to(device).eval()
     batch = {
-        OBS_STATE: torch.zeros(1, 1, 4, device=device),
+        OBS_STATE: torch.zeros(1, 4, device=device),
         OBS_LANGUAGE_TOKENS: torch.arange(N_TOKENS, device=device)[None],
         OBS_LANGUAGE_ATTENTION_MASK: torch.ones(1, N_TOKENS, dtype=torch.bool, device=device),
     }
-    return lambda: policy.predict_action_chunk(dict(batch))
+
+    def plan() -> torch.Tensor:
+        policy.reset()  # or the action would be one of the last chunk's
+        return policy.select_action(dict(batch))  # which it changes
+
+    return plan
 
 
 def _compare(
