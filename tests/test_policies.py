@@ -5,12 +5,14 @@ from typing import Any
 import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.optim import AdamWConfig
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
 from torch import Tensor
 
 from lerobot_pf2mp import FMPConfig, PF2MPConfig, PotentialFieldProcessorStep
 from lerobot_pf2mp.errors import ConfigError
+from lerobot_pf2mp.fused_adamw import FusedAdamWConfig
 from lerobot_pf2mp.policies.fmp.modeling_fmp import FMPPolicy
 from lerobot_pf2mp.policies.pf2mp.modeling_pf2mp import PF2MPPolicy
 from lerobot_pf2mp.potential_field_processor import POTENTIAL_FIELD, DemonstratedActions
@@ -152,7 +154,9 @@ def test_a_sample_of_nothing_but_padding_has_no_loss():
 def test_training_lowers_the_loss():
     policy = fmp().train()
     batch = training_batch(policy, 16)
-    optimiser = torch.optim.AdamW(policy.get_optim_params(), lr=1e-2)
+    optimiser = (
+        FMPConfig(device="cpu", optimizer_lr=1e-2).get_optimizer_preset().build(policy.get_optim_params())
+    )
     start = loss_of(policy, batch).item()
     for _ in range(40):
         loss = policy(batch)[0]
@@ -160,6 +164,21 @@ def test_training_lowers_the_loss():
         loss.backward()
         optimiser.step()
     assert loss_of(policy, batch).item() < 0.9 * start
+
+
+def test_the_optimiser_takes_the_steps_of_lerobots_adamw():
+    options = {"lr": 1e-2, "betas": (0.9, 0.99), "eps": 1e-7, "weight_decay": 0.1, "grad_clip_norm": 1.0}
+    gradients = torch.randn(5, 3, 50, generator=torch.Generator().manual_seed(0))
+    found = []
+    for config in (FusedAdamWConfig(**options), AdamWConfig(**options)):
+        weights = torch.nn.Parameter(torch.ones(3, 50))
+        optimiser = config.build([weights])
+        for weights.grad in gradients:
+            optimiser.step()
+        found.append(weights.detach())
+    torch.testing.assert_close(*found, rtol=1e-5, atol=1e-7)
+    assert not torch.equal(found[0], torch.ones(3, 50))
+    assert FMPConfig(device="cpu").get_optimizer_preset().build([weights]).param_groups[0]["fused"]
 
 
 def test_gradient_checkpointing_changes_neither_loss_nor_gradient():

@@ -5,12 +5,12 @@ import math
 from dataclasses import dataclass, field
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
-from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
 
 from lerobot_pf2mp.errors import reported_on_the_command_line
 from lerobot_pf2mp.flow_matching import INTEGRATORS, TIME_SAMPLINGS
+from lerobot_pf2mp.fused_adamw import FusedAdamWConfig
 
 
 @PreTrainedConfig.register_subclass("fmp")
@@ -202,9 +202,9 @@ class FMPConfig(PreTrainedConfig):
             if crop[0] > limit[0] or crop[1] > limit[1]:
                 raise ValueError(f"crop_shape must fit into the images of {limit} pixels, got {crop}")
 
-    def get_optimizer_preset(self) -> AdamWConfig:
+    def get_optimizer_preset(self) -> FusedAdamWConfig:
         """AdamW with this configuration's values."""
-        return AdamWConfig(
+        return FusedAdamWConfig(
             lr=self.optimizer_lr,
             betas=self.optimizer_betas,
             eps=self.optimizer_eps,
