@@ -97,7 +97,7 @@ class KernelTree:
             ``(Q, D)`` offsets to the nearest target; zero where the log sum is above `log_sum`.
         """
         if torch.compiler.is_compiling():
-            return _offsets_operator(*self._parts, *targets._parts, queries, log_sum)
+            return self.steps_to(targets, queries, log_sum, share=0.0, reach=math.inf)
         queries = queries.contiguous()
         offsets = torch.empty_like(queries)
         _kernel_tree.lead_to_targets(
@@ -162,25 +162,6 @@ def _(
     return queries.new_empty(queries.shape), queries.new_empty(len(queries))
 
 
-@torch.library.custom_op("lerobot_pf2mp::offsets_to_targets", mutates_args=(), device_types="cpu")
-def _offsets_operator(
-    leaves: Tensor,
-    boxes: Tensor,
-    centre: Tensor,
-    scale: float,
-    reach: float,
-    target_leaves: Tensor,
-    target_boxes: Tensor,
-    target_centre: Tensor,
-    target_scale: float,
-    target_reach: float,
-    queries: Tensor,
-    log_sum: float,
-) -> Tensor:
-    targets = KernelTree(target_leaves, target_boxes, target_centre, target_scale, target_reach)
-    return KernelTree(leaves, boxes, centre, scale, reach).offsets_to(targets, queries, log_sum)
-
-
 @torch.library.custom_op("lerobot_pf2mp::steps_to_targets", mutates_args=(), device_types="cpu")
 def _steps_operator(
     leaves: Tensor,
@@ -203,7 +184,6 @@ def _steps_operator(
     return tree.steps_to(targets, queries, log_sum, share, step_reach)
 
 
-@_offsets_operator.register_fake
 @_steps_operator.register_fake
 def _(*arguments: Tensor | float) -> Tensor:
     queries = arguments[10]

@@ -152,5 +152,4 @@ def test_the_extensions_operators_are_proper_ones() -> None:
     targets = KernelSums(paths(100, 2), 0.05).tree._parts
     queries = paths(50, 2, seed=1)
     torch.library.opcheck(kernel_tree._sums_operator, (*parts, queries))
-    torch.library.opcheck(kernel_tree._offsets_operator, (*parts, *targets, queries, 0.5))
     torch.library.opcheck(kernel_tree._steps_operator, (*parts, *targets, queries, 0.5, 0.3, 0.1))
