@@ -21,9 +21,9 @@ tables:
 clean:
 	rm -rf .venv .venv-bench demo build *.egg-info
 
-.venv/installed: pyproject.toml constraints.txt lerobot_pf2mp/_kernel_tree.c
+.venv/installed: pyproject.toml constraints.txt lerobot_pf2mp/density/_kernel_tree.c
 	@.ci/set_up .venv dev
 
 # Apart from the tests' environment: with transformers, every command of LeRobot starts 2.5 seconds later.
-.venv-bench/installed: pyproject.toml constraints.txt lerobot_pf2mp/_kernel_tree.c
+.venv-bench/installed: pyproject.toml constraints.txt lerobot_pf2mp/density/_kernel_tree.c
 	@.ci/set_up .venv-bench bench

@@ -25,8 +25,8 @@ from tqdm import tqdm
 from lerobot_pf2mp.errors import explained
 from lerobot_pf2mp.loading import load_config
 from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
-from lerobot_pf2mp.potential_field_processor import PotentialFieldProcessorStep
-from lerobot_pf2mp.written_beside import written_beside
+from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
+from lerobot_pf2mp.process.atomic_files import written_beside
 
 GUIDED_TYPES = {"fmp": "pf2mp", "pf2mp": "pf2mp", "diffusion": "dppf", "dppf": "dppf"}
 

@@ -22,9 +22,9 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from lerobot_pf2mp.kernel_density import PAIRS_PER_BLOCK, check_bandwidth, log_kernels, select_bandwidth
-from lerobot_pf2mp.kernel_sums import KernelSums
-from lerobot_pf2mp.kernel_tree import KernelTree
+from lerobot_pf2mp.density.kernel_sums import KernelSums
+from lerobot_pf2mp.density.kernel_tree import KernelTree
+from lerobot_pf2mp.density.kernels import PAIRS_PER_BLOCK, check_bandwidth, log_kernels, select_bandwidth
 
 _TINY = torch.finfo(torch.float32).tiny
 

@@ -19,16 +19,17 @@ from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 from lerobot.policies.factory import get_policy_class
 from torch import Tensor
 
-from lerobot_pf2mp import DPPFConfig, FMPConfig, PF2MPConfig, PF2MPMazeEnv, evaluation, load_policy
-from lerobot_pf2mp.benchmark import run_benchmark
-from lerobot_pf2mp.benchmark_spec import NONE, BenchmarkSpec, Guidance
-from lerobot_pf2mp.envs.maze import MazeEnv
+from lerobot_pf2mp import DPPFConfig, FMPConfig, PF2MPConfig, PF2MPMazeEnv, load_policy
+from lerobot_pf2mp.benchmark import evaluation
+from lerobot_pf2mp.benchmark.run import run_benchmark
+from lerobot_pf2mp.benchmark.spec import NONE, BenchmarkSpec, Guidance
+from lerobot_pf2mp.envs.maze.maze_env import MazeEnv
 from lerobot_pf2mp.errors import ConfigError
 from lerobot_pf2mp.policies.dppf.modeling_dppf import DPPFPolicy
 from lerobot_pf2mp.policies.fmp import modeling_fmp
+from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
 from lerobot_pf2mp.policies.pf2mp.modeling_pf2mp import PF2MPPolicy
-from lerobot_pf2mp.potential_field_processor import PotentialFieldProcessorStep
-from lerobot_pf2mp.results import EpisodeRow, SummaryRow, read_rows
+from lerobot_pf2mp.results.rows import EpisodeRow, SummaryRow, read_rows
 
 STATE, ENV, ACTION = "observation.state", "observation.environment_state", "action"
 UMAZE = "MazeUMaze-v0"

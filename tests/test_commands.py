@@ -16,8 +16,8 @@ from test_benchmark import write_checkpoint
 from test_convert import FOREIGN_LAYOUT, demonstrations, line, write_d4rl, write_pointmaze
 from test_results import SUMMARY, UNGUIDED
 
-from lerobot_pf2mp import cli
-from lerobot_pf2mp.results import EpisodeRow, SummaryRow, read_rows, write_rows
+from lerobot_pf2mp.commands import cli
+from lerobot_pf2mp.results.rows import EpisodeRow, SummaryRow, read_rows, write_rows
 
 BIN = Path(sys.executable).parent
 SECONDS = 120

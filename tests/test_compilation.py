@@ -9,12 +9,13 @@ from demonstrated_paths import paths
 from lerobot.configs import FeatureType, PolicyFeature
 from torch import Tensor
 
-from lerobot_pf2mp import FMPConfig, PF2MPConfig, kernel_tree
-from lerobot_pf2mp.kernel_sums import KernelSums
+from lerobot_pf2mp import FMPConfig, PF2MPConfig
+from lerobot_pf2mp.density import kernel_tree
+from lerobot_pf2mp.density.kernel_sums import KernelSums
 from lerobot_pf2mp.policies.fmp.modeling_fmp import FMPPolicy
+from lerobot_pf2mp.policies.guided.potential_field_step import POTENTIAL_FIELD, DemonstratedActions
 from lerobot_pf2mp.policies.pf2mp.modeling_pf2mp import PF2MPPolicy
 from lerobot_pf2mp.potential_field import PotentialField, fit
-from lerobot_pf2mp.potential_field_processor import POTENTIAL_FIELD, DemonstratedActions
 
 HORIZON, ACTION_DIM, STATE = 16, 2, "observation.state"
 
@@ -30,7 +31,7 @@ def _fresh_compiler() -> None:
 def sums(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Kernel sums from the C extension, and from attention as if it could not be built."""
     if request.param == "attention":
-        monkeypatch.setattr("lerobot_pf2mp.kernel_tree._kernel_tree", None)
+        monkeypatch.setattr("lerobot_pf2mp.density.kernel_tree._kernel_tree", None)
     elif not kernel_tree.is_available():
         pytest.skip("the C extension could not be built")
     return request.param

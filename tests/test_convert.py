@@ -11,14 +11,14 @@ import h5py
 import numpy as np
 import pytest
 from lerobot.datasets import LeRobotDataset
-from lerobot_pf2mp.dataset_tools import convert_d4rl
-from lerobot_pf2mp.dataset_tools.convert_d4rl import read_d4rl
-from lerobot_pf2mp.dataset_tools.convert_minari import read_minari
-from lerobot_pf2mp.dataset_tools.episodes import Trajectory, resample
-from lerobot_pf2mp.dataset_tools.maze_dataset import write_maze_dataset
-from lerobot_pf2mp.dataset_tools.maze_expert import MazeExpert
 
-from lerobot_pf2mp.envs.point_maze import parse_maze_map
+from lerobot_pf2mp.dataset_tools.maze import convert_d4rl
+from lerobot_pf2mp.dataset_tools.maze.convert_d4rl import read_d4rl
+from lerobot_pf2mp.dataset_tools.maze.convert_minari import read_minari
+from lerobot_pf2mp.dataset_tools.maze.maze_dataset import write_maze_dataset
+from lerobot_pf2mp.dataset_tools.maze.maze_expert import MazeExpert
+from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory, resample
+from lerobot_pf2mp.envs.maze.point_maze import parse_maze_map
 
 LOPSIDED = (
     "1111111/1000001/1111101/1110001/1111111"  # tells rows from columns, north from south, east from west

@@ -15,16 +15,16 @@ import pytest
 import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from lerobot_pf2mp.dataset_tools import lerobot_writer
-from lerobot_pf2mp.dataset_tools.collect_maze import collect_maze
-from lerobot_pf2mp.dataset_tools.episodes import Trajectory, prepare, resample
-from lerobot_pf2mp.dataset_tools.lerobot_writer import DatasetSpec, write_dataset
-from lerobot_pf2mp.dataset_tools.maze_dataset import MAZE_OF_TASK, maze_of, write_maze_dataset
-from lerobot_pf2mp.dataset_tools.maze_expert import MazeExpert
 
-from lerobot_pf2mp.envs.maze import SUCCESS_RADIUS
-from lerobot_pf2mp.envs.point_maze import BALL_RADIUS, make_point_maze
-from lerobot_pf2mp.envs.swept_ball import SweptBall
+from lerobot_pf2mp.dataset_tools.maze.collect_maze import collect_maze
+from lerobot_pf2mp.dataset_tools.maze.maze_dataset import MAZE_OF_TASK, maze_of, write_maze_dataset
+from lerobot_pf2mp.dataset_tools.maze.maze_expert import MazeExpert
+from lerobot_pf2mp.dataset_tools.writing import lerobot_writer
+from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory, prepare, resample
+from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, write_dataset
+from lerobot_pf2mp.envs.maze.maze_env import SUCCESS_RADIUS
+from lerobot_pf2mp.envs.maze.point_maze import BALL_RADIUS, make_point_maze
+from lerobot_pf2mp.envs.maze.swept_ball import SweptBall
 
 CORRIDOR = "1111111/1000001/1111111"
 SPEC = DatasetSpec(

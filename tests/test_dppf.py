@@ -15,15 +15,15 @@ from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 from lerobot.policies.factory import get_policy_class
 from lerobot.processor import PolicyProcessorPipeline
-from lerobot_pf2mp.dataset_tools.collect_maze import collect_maze
 from safetensors.torch import load_file
 from torch import Tensor
 
 from lerobot_pf2mp import DPPFConfig, PotentialFieldProcessorStep, load_policy
+from lerobot_pf2mp.dataset_tools.maze.collect_maze import collect_maze
 from lerobot_pf2mp.errors import ConfigError
 from lerobot_pf2mp.guidance import GUIDANCE_INTEGRATORS, GUIDANCE_POINTS, EulerGuide, ProximalGuide
 from lerobot_pf2mp.policies.dppf.modeling_dppf import DPPFPolicy
-from lerobot_pf2mp.potential_field_processor import POTENTIAL_FIELD, DemonstratedActions
+from lerobot_pf2mp.policies.guided.potential_field_step import POTENTIAL_FIELD, DemonstratedActions
 
 STATE, ENV, ACTION = "observation.state", "observation.environment_state", "action"
 FRONT = "observation.images.front"

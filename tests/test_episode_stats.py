@@ -2,7 +2,8 @@
 import numpy as np
 import pytest
 from lerobot.datasets.compute_stats import aggregate_stats, compute_episode_stats
-from lerobot_pf2mp.dataset_tools.episode_stats import aggregate_episodes, compute_stats
+
+from lerobot_pf2mp.dataset_tools.writing.episode_stats import aggregate_episodes, compute_stats
 
 LENGTHS = np.array([80, 1, 2, 80, 3, 1, 300, 5, 64, 100, 129, 2])
 KINDS = {

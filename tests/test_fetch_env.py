@@ -27,8 +27,8 @@ from scipy.spatial import ConvexHull
 from torch import nn
 
 from lerobot_pf2mp.envs import FETCH_TASKS, PF2MPFetchEnv, headless
-from lerobot_pf2mp.envs.fetch import FetchEnv
-from lerobot_pf2mp.envs.fetch_scene import (
+from lerobot_pf2mp.envs.fetch.fetch_env import FetchEnv
+from lerobot_pf2mp.envs.fetch.fetch_scene import (
     BLOCK_SIZE,
     FETCH_SCENES,
     FINGERS,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lerobot_pf2mp.envs.box import Box
-from lerobot_pf2mp.envs.fetch_scene import (
+from lerobot_pf2mp.envs.fetch.fetch_scene import (
     BLOCK_HEIGHT,
     BLOCK_SIZE,
     FETCH_SCENES,

@@ -20,19 +20,19 @@ import h5py
 import numpy as np
 import pytest
 from lerobot.datasets import LeRobotDataset
-from lerobot_pf2mp.dataset_tools import collect_fetch as collecting
-from lerobot_pf2mp.dataset_tools.collect_fetch import collect_fetch
-from lerobot_pf2mp.dataset_tools.convert_fetch import convert_fetch, read_fetch
-from lerobot_pf2mp.dataset_tools.episodes import Trajectory, prepare
-from lerobot_pf2mp.dataset_tools.fetch_expert import STYLES, Recording, ScriptedFetchExpert
-from lerobot_pf2mp.dataset_tools.fetch_routes import length, routes, walk
 from scipy.sparse.csgraph import shortest_path
 from test_convert import write_minari
 
-from lerobot_pf2mp import cli
+from lerobot_pf2mp.commands import cli
+from lerobot_pf2mp.dataset_tools.fetch import collect_fetch as collecting
+from lerobot_pf2mp.dataset_tools.fetch.collect_fetch import collect_fetch
+from lerobot_pf2mp.dataset_tools.fetch.convert_fetch import convert_fetch, read_fetch
+from lerobot_pf2mp.dataset_tools.fetch.fetch_expert import STYLES, Recording, ScriptedFetchExpert
+from lerobot_pf2mp.dataset_tools.fetch.fetch_routes import length, routes, walk
+from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory, prepare
 from lerobot_pf2mp.envs.box import Box
-from lerobot_pf2mp.envs.fetch import MAX_STEP, FetchEnv
-from lerobot_pf2mp.envs.fetch_scene import BLOCK_SIZE, FETCH_SCENES, FINGERS, HAND, WORKSPACE
+from lerobot_pf2mp.envs.fetch.fetch_env import MAX_STEP, FetchEnv
+from lerobot_pf2mp.envs.fetch.fetch_scene import BLOCK_SIZE, FETCH_SCENES, FINGERS, HAND, WORKSPACE
 
 TASKS = ("reach", "push")
 WIDTHS = {"reach": 10, "push": 25}

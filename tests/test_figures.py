@@ -13,13 +13,14 @@ from lerobot.policies import make_pre_post_processors
 from test_benchmark import EPISODE_SEED, STATE, UMAZE, spec_of, write_checkpoint
 from test_results import SUMMARY, UNGUIDED
 
-from lerobot_pf2mp import PF2MPConfig, PF2MPFetchEnv, PF2MPMazeEnv, load_policy, plots
-from lerobot_pf2mp.benchmark import run_benchmark
-from lerobot_pf2mp.figures import GuidedPolicyFigures, make_lambda_figure
-from lerobot_pf2mp.plots import Path2D, PathPair
+from lerobot_pf2mp import PF2MPConfig, PF2MPFetchEnv, PF2MPMazeEnv, load_policy
+from lerobot_pf2mp import figures as plots
+from lerobot_pf2mp.benchmark.run import run_benchmark
+from lerobot_pf2mp.figures import Path2D, PathPair
+from lerobot_pf2mp.figures.policy_figures import GuidedPolicyFigures, make_lambda_figure
+from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
 from lerobot_pf2mp.policies.pf2mp.modeling_pf2mp import PF2MPPolicy
-from lerobot_pf2mp.potential_field_processor import PotentialFieldProcessorStep
-from lerobot_pf2mp.results import EpisodeRow, SummaryRow, read_rows, write_rows
+from lerobot_pf2mp.results.rows import EpisodeRow, SummaryRow, read_rows, write_rows
 
 ENV = PF2MPMazeEnv(task=UMAZE, episode_length=6)
 EPISODES = [0, 1, 2]
@@ -107,7 +108,7 @@ def test_without_names_the_episodes_that_show_the_difference_are_drawn(
         0.0: [(9.0, False), (1.0, True), (2.0, True), (3.0, True)],
         0.8: [(9.0, False), (1.0, False), (2.0, False), (3.0, True)],
     }
-    monkeypatch.setattr("lerobot_pf2mp.figures._N_SEARCHED", 4)
+    monkeypatch.setattr("lerobot_pf2mp.figures.policy_figures._N_SEARCHED", 4)
     monkeypatch.setattr(
         figures, "_roll_out", lambda n, scale: ([straight(*way) for way in ways[scale]], [None] * n)
     )

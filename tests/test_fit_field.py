@@ -24,13 +24,14 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.factory import get_policy_class, make_policy
 from lerobot.processor import DataProcessorPipeline
-from lerobot_pf2mp.dataset_tools.lerobot_writer import DatasetSpec, write_dataset
 from safetensors.torch import load_file
 from torch import Tensor
 
-from lerobot_pf2mp import cli, load_policy
+from lerobot_pf2mp import load_policy
+from lerobot_pf2mp.commands import cli
+from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, write_dataset
 from lerobot_pf2mp.fit_field import GUIDED_TYPES, fit_field
-from lerobot_pf2mp.potential_field_processor import DemonstratedActions
+from lerobot_pf2mp.policies.guided.potential_field_step import DemonstratedActions
 
 BIN = Path(sys.executable).parent
 SECONDS = 600  # for a command, on a machine that is busy with other things
@@ -929,7 +930,7 @@ def test_the_hub_of_these_tests_answers_the_real_client(tmp_path):
 
 COMMANDS = """
 import json, sys, traceback
-from lerobot_pf2mp import cli
+from lerobot_pf2mp.commands import cli
 
 for name, arguments in json.loads(sys.argv[1]).items():
     sys.argv = ["pf2mp-fit-field", *arguments]

@@ -9,9 +9,9 @@ from lerobot_pf2mp import PF2MPConfig
 from lerobot_pf2mp.errors import ConfigError
 from lerobot_pf2mp.flow_matching import integrate
 from lerobot_pf2mp.guidance import GUIDANCE_INTEGRATORS, GUIDANCE_POINTS, make_guide
+from lerobot_pf2mp.policies.guided.potential_field_step import POTENTIAL_FIELD, DemonstratedActions
 from lerobot_pf2mp.policies.pf2mp.modeling_pf2mp import PF2MPPolicy
 from lerobot_pf2mp.potential_field import PotentialField, fit
-from lerobot_pf2mp.potential_field_processor import POTENTIAL_FIELD, DemonstratedActions
 
 
 def random_field(dim: int = 2, alpha: float = 0.0, bandwidth: float = 0.2) -> PotentialField:

@@ -24,14 +24,14 @@ from lerobot.scripts.lerobot_eval import rollout
 from torch import nn
 
 from lerobot_pf2mp.envs import HANDWRITING_TASKS, PF2MPHandwritingEnv
-from lerobot_pf2mp.envs.handwriting import START_SPREAD, HandwritingEnv
-from lerobot_pf2mp.envs.ink import COVERED, INK_HEIGHT, LARGEST_ERROR, Ink
-from lerobot_pf2mp.envs.letters import LETTERS
-from lerobot_pf2mp.envs.panda import HOME, JOINT_NAMES, PEN_TRAVEL, TABLE
-from lerobot_pf2mp.envs.regions import Disc
-from lerobot_pf2mp.envs.sheet import SHEET_CENTRE, SHEET_SIDE
-from lerobot_pf2mp.envs.stroke import evenly_spaced
-from lerobot_pf2mp.envs.writing_scene import WritingScene, make_writing_scene
+from lerobot_pf2mp.envs.handwriting.handwriting_env import START_SPREAD, HandwritingEnv
+from lerobot_pf2mp.envs.handwriting.ink import COVERED, INK_HEIGHT, LARGEST_ERROR, Ink
+from lerobot_pf2mp.envs.handwriting.letters import LETTERS
+from lerobot_pf2mp.envs.handwriting.panda import HOME, JOINT_NAMES, PEN_TRAVEL, TABLE
+from lerobot_pf2mp.envs.handwriting.regions import Disc
+from lerobot_pf2mp.envs.handwriting.sheet import SHEET_CENTRE, SHEET_SIDE
+from lerobot_pf2mp.envs.handwriting.stroke import evenly_spaced
+from lerobot_pf2mp.envs.handwriting.writing_scene import WritingScene, make_writing_scene
 from lerobot_pf2mp.errors import ConfigError
 
 SPACES = ("joint", "pen")

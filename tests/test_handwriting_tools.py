@@ -13,21 +13,21 @@ import mujoco
 import numpy as np
 import pytest
 from lerobot.datasets import LeRobotDataset
-from lerobot_pf2mp.dataset_tools.attempts import successful
-from lerobot_pf2mp.dataset_tools.collect_handwriting import collect_handwriting
-from lerobot_pf2mp.dataset_tools.convert_handwriting import convert_handwriting
-from lerobot_pf2mp.dataset_tools.episodes import Trajectory
-from lerobot_pf2mp.dataset_tools.handwriting_expert import ScriptedScribe, vary
-from lerobot_pf2mp.dataset_tools.handwriting_recording import read_handwriting
-from lerobot_pf2mp.dataset_tools.lerobot_writer import DatasetSpec, write_dataset
 from scipy.spatial import KDTree
 
-from lerobot_pf2mp import cli
-from lerobot_pf2mp.envs.handwriting import CONTROLS, SPACES, START_SPREAD, HandwritingEnv
-from lerobot_pf2mp.envs.panda import GRIP, HOME, JOINT_NAMES, PEN_TIP, make_panda
-from lerobot_pf2mp.envs.sheet import SHEET_CENTRE, SHEET_SIDE
-from lerobot_pf2mp.envs.stroke import distances
-from lerobot_pf2mp.envs.writing_scene import make_writing_scene
+from lerobot_pf2mp.commands import cli
+from lerobot_pf2mp.dataset_tools.handwriting.collect_handwriting import collect_handwriting
+from lerobot_pf2mp.dataset_tools.handwriting.convert_handwriting import convert_handwriting
+from lerobot_pf2mp.dataset_tools.handwriting.handwriting_expert import ScriptedScribe, vary
+from lerobot_pf2mp.dataset_tools.handwriting.handwriting_recording import read_handwriting
+from lerobot_pf2mp.dataset_tools.writing.attempts import successful
+from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory
+from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, write_dataset
+from lerobot_pf2mp.envs.handwriting.handwriting_env import CONTROLS, SPACES, START_SPREAD, HandwritingEnv
+from lerobot_pf2mp.envs.handwriting.panda import GRIP, HOME, JOINT_NAMES, PEN_TIP, make_panda
+from lerobot_pf2mp.envs.handwriting.sheet import SHEET_CENTRE, SHEET_SIDE
+from lerobot_pf2mp.envs.handwriting.stroke import distances
+from lerobot_pf2mp.envs.handwriting.writing_scene import make_writing_scene
 
 # Letters that are not held out for measurements: one with an inflection, with corners, closed, and one that crosses itself.
 LETTERS = ("S", "M", "O", "8")

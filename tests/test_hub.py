@@ -25,8 +25,9 @@ from lerobot.policies.factory import get_policy_class
 from lerobot.utils.constants import ACTION
 from safetensors.torch import load_file, save_file
 
-from lerobot_pf2mp import PF2MPMazeEnv, cli, load_policy
-from lerobot_pf2mp.model_card import env_options
+from lerobot_pf2mp import PF2MPMazeEnv, load_policy
+from lerobot_pf2mp.commands import cli
+from lerobot_pf2mp.hub.model_card import env_options
 
 BIN = Path(sys.executable).parent
 SECONDS = 600  # for a command, on a machine that is busy with other things
@@ -67,7 +68,8 @@ import json, os, sys, traceback
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_pre_post_processors
-from lerobot_pf2mp import cli, load_policy
+from lerobot_pf2mp import load_policy
+from lerobot_pf2mp.commands import cli
 from lerobot.policies.factory import get_policy_class
 
 def act(policy, preprocess, postprocess):
@@ -729,7 +731,9 @@ def chain(hub: HubServer, folder: Path) -> Path:
     """Collects and publishes demonstrations, trains on them and publishes the policy, and trains that one further."""
     home = folder / "chain"
     home.mkdir()
-    collect = "from lerobot_pf2mp import cli; import sys; sys.argv[0] = 'pf2mp-collect'; cli.collect()"
+    collect = (
+        "from lerobot_pf2mp.commands import cli; import sys; sys.argv[0] = 'pf2mp-collect'; cli.collect()"
+    )
     for seed, n_episodes in ((1, 6), (0, 5)):  # the second time over the first
         said = run(
             hub,

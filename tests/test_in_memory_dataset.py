@@ -8,9 +8,9 @@ import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.sampler import EpisodeAwareSampler
-from lerobot_pf2mp.dataset_tools.lerobot_writer import DatasetSpec, write_dataset
 
-from lerobot_pf2mp.in_memory_dataset import InMemoryDataset, fits_in_memory
+from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, write_dataset
+from lerobot_pf2mp.training.in_memory_dataset import InMemoryDataset, fits_in_memory
 
 FPS = 10
 LENGTHS = [7, 1, 12, 5]

@@ -9,8 +9,14 @@ from pathlib import Path
 import pytest
 from lerobot.scripts import lerobot_train
 
-from lerobot_pf2mp import cli
-from lerobot_pf2mp.interruption import INTERRUPTED, TERMINATED, Terminated, exit_code, sigterm_like_ctrl_c
+from lerobot_pf2mp.commands import cli
+from lerobot_pf2mp.process.interruption import (
+    INTERRUPTED,
+    TERMINATED,
+    Terminated,
+    exit_code,
+    sigterm_like_ctrl_c,
+)
 
 
 @pytest.fixture
@@ -47,7 +53,7 @@ def test_a_second_sigterm_at_once_does_not_interrupt_the_clean_up(outside: list[
 
 
 def test_a_later_sigterm_interrupts_the_clean_up(outside: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lerobot_pf2mp.interruption._AT_ONCE", 0.0)
+    monkeypatch.setattr("lerobot_pf2mp.process.interruption._AT_ONCE", 0.0)
     with sigterm_like_ctrl_c():
         for _ in range(2):
             with pytest.raises(Terminated):
@@ -79,7 +85,7 @@ def test_a_forked_process_ends_by_sigterm_and_says_nothing(tmp_path: Path) -> No
     (tmp_path / "program.py").write_text(
         """
 import multiprocessing, os, signal, time
-from lerobot_pf2mp.interruption import sigterm_like_ctrl_c
+from lerobot_pf2mp.process.interruption import sigterm_like_ctrl_c
 
 if __name__ == "__main__":
     with sigterm_like_ctrl_c():

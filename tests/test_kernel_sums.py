@@ -8,8 +8,8 @@ import pytest
 import torch
 from demonstrated_paths import brute_force, paths
 
-from lerobot_pf2mp import kernel_tree
-from lerobot_pf2mp.kernel_sums import KernelSums
+from lerobot_pf2mp.density import kernel_tree
+from lerobot_pf2mp.density.kernel_sums import KernelSums
 
 WAYS = {
     "the fastest": lambda sums, q: sums(q),
@@ -99,7 +99,7 @@ def test_float32_is_used_only_where_it_resolves_the_weights() -> None:
 def test_without_the_extension_attention_gives_the_same_sums(monkeypatch: pytest.MonkeyPatch) -> None:
     sums, queries = KernelSums(paths(1000, 2), 0.02), paths(100, 2, seed=1)
     wanted = sums(queries)
-    monkeypatch.setattr("lerobot_pf2mp.kernel_tree._kernel_tree", None)
+    monkeypatch.setattr("lerobot_pf2mp.density.kernel_tree._kernel_tree", None)
     without = KernelSums(sums.anchors, sums.bandwidth)
     for one, other in zip(without(queries), wanted, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
@@ -123,7 +123,7 @@ def test_autocast_and_inference_mode_change_nothing() -> None:
 def test_memory_does_not_grow_with_the_pairs(way: str) -> None:
     code = f"""
 import resource, torch
-from lerobot_pf2mp.kernel_sums import KernelSums
+from lerobot_pf2mp.density.kernel_sums import KernelSums
 def peak(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # [MB]
 q, sums = torch.rand(20_000, 2), KernelSums(torch.rand(20_000, 2), 0.01)
 sums.{way.replace("(q", "(q[:300]")}

@@ -12,9 +12,9 @@ import pytest
 import torch
 from demonstrated_paths import brute_force, paths
 
-from lerobot_pf2mp import kernel_tree
-from lerobot_pf2mp.kernel_sums import KernelSums
-from lerobot_pf2mp.kernel_tree import KernelTree
+from lerobot_pf2mp.density import kernel_tree
+from lerobot_pf2mp.density.kernel_sums import KernelSums
+from lerobot_pf2mp.density.kernel_tree import KernelTree
 
 sys.path.append(str(Path(__file__).parent / "benchmarks"))
 

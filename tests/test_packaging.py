@@ -34,7 +34,7 @@ for name in ("fmp", "pf2mp", "dppf"):
     make_pre_post_processors(config)
 assert "pf2mp_maze" in EnvConfig.get_known_choices()
 assert "lerobot_pf2mp/MazeLarge-v0" in gymnasium.registry
-import lerobot_pf2mp.dataset_tools.collect_maze
+import lerobot_pf2mp.dataset_tools.maze.collect_maze
 print("discovered")
 """
 

@@ -13,13 +13,13 @@ import torch
 import torchvision
 from lerobot.datasets import LeRobotDataset
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, env_to_policy_features
-from lerobot_pf2mp.dataset_tools.collect_fetch import collect_fetch
-from lerobot_pf2mp.dataset_tools.collect_handwriting import collect_handwriting
-from lerobot_pf2mp.dataset_tools.collect_maze import collect_maze
-from lerobot_pf2mp.dataset_tools.lerobot_writer import DatasetSpec, picture_feature
-from lerobot_pf2mp.dataset_tools.video_writer import write_video_dataset
 
 from lerobot_pf2mp import PF2MPFetchEnv, PF2MPHandwritingEnv, PF2MPMazeEnv, load_policy
+from lerobot_pf2mp.dataset_tools.fetch.collect_fetch import collect_fetch
+from lerobot_pf2mp.dataset_tools.handwriting.collect_handwriting import collect_handwriting
+from lerobot_pf2mp.dataset_tools.maze.collect_maze import collect_maze
+from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, picture_feature
+from lerobot_pf2mp.dataset_tools.writing.video_writer import write_video_dataset
 from lerobot_pf2mp.errors import ConfigError
 
 BIN = Path(sys.executable).parent

@@ -16,12 +16,12 @@ from PIL import Image
 from test_results import SUMMARY, UNGUIDED, cell
 from torch import Tensor
 
-from lerobot_pf2mp import plots
+from lerobot_pf2mp import figures
 from lerobot_pf2mp.envs.box import Box
-from lerobot_pf2mp.plots import THEMES, Path2D, PathPair, Scene
-from lerobot_pf2mp.plots.space import faces
+from lerobot_pf2mp.figures import THEMES, Path2D, PathPair, Scene
+from lerobot_pf2mp.figures.space import faces
 from lerobot_pf2mp.potential_field import PotentialField, fit
-from lerobot_pf2mp.results import Cell
+from lerobot_pf2mp.results.rows import Cell
 
 SCALE, SHIFT = torch.tensor([2.0, 1.0]), torch.tensor([0.5, -0.5])  # of normalised actions to metres
 MAZE_MAP = [[1, 1, 1, 1], [1, 0, 0, 1], [1, 1, 1, 1]]
@@ -101,7 +101,7 @@ def lambda_cells(**common: Any) -> list[Cell]:
 
 
 def test_lambda_shows_every_integrator_and_the_unguided_level(tmp_path: Path, drawn: list[Figure]) -> None:
-    plots.plot_lambda(tmp_path / "lambda.png", cells=lambda_cells())
+    figures.plot_lambda(tmp_path / "lambda.png", cells=lambda_cells())
     (figure,) = drawn
     collision, success = figure.axes
     assert (collision.get_ylabel(), success.get_ylabel()) == ("collision rate [%]", "success rate [%]")
@@ -122,7 +122,7 @@ def test_lambda_shows_every_integrator_and_the_unguided_level(tmp_path: Path, dr
 
 
 def test_lambda_shows_intervals(tmp_path: Path, drawn: list[Figure]) -> None:
-    plots.plot_lambda(tmp_path / "lambda.png", cells=lambda_cells())
+    figures.plot_lambda(tmp_path / "lambda.png", cells=lambda_cells())
     bands = [band.get_datalim(drawn[0].axes[0].transData) for band in drawn[0].axes[0].collections]
     # Wilson's intervals of 1, 2 and 5 of 50: the lowest and the highest end.
     assert any(band.ymin == pytest.approx(0.354, abs=1e-3) and band.ymax == pytest.approx(21.36, abs=1e-2)
@@ -134,7 +134,7 @@ def test_policies_of_one_integrator_have_lines_of_their_own(tmp_path: Path, draw
         Cell(tuple(replace(row, policy="dppf" if row.guidance_scale else "dp") for row in one.repeats))
         for one in lambda_cells()
     ]
-    plots.plot_lambda(tmp_path / "lambda.png", cells=[*lambda_cells(), *others])
+    figures.plot_lambda(tmp_path / "lambda.png", cells=[*lambda_cells(), *others])
     lines = lines_of(drawn[0].axes[0])
     names = ("pf2mp, proximal", "dppf, proximal", "fmp, no guidance", "dp, no guidance")
     styles = {(lines[name].get_color(), lines[name].get_linestyle()) for name in names}
@@ -146,7 +146,7 @@ def test_policies_of_one_integrator_have_lines_of_their_own(tmp_path: Path, draw
 )
 def test_lambda_needs_guided_results_of_one_task(tmp_path: Path, cells: list[Cell]) -> None:
     with pytest.raises(ValueError, match="results must be of one task and hold guided policies, got tasks"):
-        plots.plot_lambda(tmp_path / "lambda.png", cells=cells)
+        figures.plot_lambda(tmp_path / "lambda.png", cells=cells)
     assert not list(tmp_path.iterdir())
 
 
@@ -155,7 +155,7 @@ def test_lambda_needs_guided_results_of_one_task(tmp_path: Path, cells: list[Cel
 
 def test_density_is_drawn_where_the_demonstrations_are(tmp_path: Path, drawn: list[Figure]) -> None:
     scene = scene_of((0.0, 0.0), (0.0, 0.0), (0.5, 0.5))
-    plots.plot_density(tmp_path / "density.png", scene=scene)
+    figures.plot_density(tmp_path / "density.png", scene=scene)
     axis, bar = drawn[0].axes
     (mesh,) = (child for child in axis.collections if child.get_array() is not None)
     shown = mesh.get_array()
@@ -177,7 +177,7 @@ def test_density_is_drawn_where_the_demonstrations_are(tmp_path: Path, drawn: li
 
 
 def test_arrows_point_to_the_demonstrations(tmp_path: Path, drawn: list[Figure]) -> None:
-    plots.plot_arrows(tmp_path / "arrows.png", scene=scene_of((0.1, 0.2), (0.1, 0.2), maze_map=MAZE_MAP))
+    figures.plot_arrows(tmp_path / "arrows.png", scene=scene_of((0.1, 0.2), (0.1, 0.2), maze_map=MAZE_MAP))
     (arrows,) = (child for child in drawn[0].axes[0].collections if isinstance(child, Quiver))
     # In normalised units they point at the anchor; a step of them scales by metres for each unit once more.
     offsets = (np.array([0.1, 0.2]) - (arrows.XY - SHIFT.numpy()) / SCALE.numpy()) * SCALE.numpy()
@@ -197,7 +197,7 @@ def test_arrows_point_to_the_demonstrations(tmp_path: Path, drawn: list[Figure])
     ],
 )
 def test_a_field_is_drawn_in_the_plane_only(tmp_path: Path, scene: Scene, found: str) -> None:
-    for draw in (plots.plot_density, plots.plot_arrows):
+    for draw in (figures.plot_density, figures.plot_arrows):
         with pytest.raises(ValueError, match=f"needs a potential field over 2 action dimensions, {found}"):
             draw(tmp_path / "figure.png", scene=scene)
     assert not list(tmp_path.iterdir())
@@ -217,7 +217,7 @@ def test_the_extent_is_that_of_the_maze_or_else_of_the_demonstrations() -> None:
 
 def test_trajectories_show_both_ways_their_ends_and_collisions(tmp_path: Path, drawn: list[Figure]) -> None:
     pairs = [replace(PAIR, episode=i) for i in range(4)]
-    plots.plot_trajectories(
+    figures.plot_trajectories(
         tmp_path / "trajectories.png", scene=scene_of((0.0, 0.0), (1.0, 0.0), maze_map=MAZE_MAP), pairs=pairs
     )
     (figure,) = drawn
@@ -236,7 +236,7 @@ def test_trajectories_show_both_ways_their_ends_and_collisions(tmp_path: Path, d
 
 
 def test_trajectories_of_three_coordinates_are_drawn_in_space(tmp_path: Path, drawn: list[Figure]) -> None:
-    plots.plot_trajectories(tmp_path / "trajectories.png", scene=Scene(to_metres), pairs=[PAIR_3D])
+    figures.plot_trajectories(tmp_path / "trajectories.png", scene=Scene(to_metres), pairs=[PAIR_3D])
     (axis,) = drawn[0].axes
     assert (axis.get_xlabel(), axis.get_ylabel(), axis.get_zlabel()) == ("x [m]", "y [m]", "z [m]")
     drawn_way = np.stack(lines_of(axis)["with guidance"].get_data_3d(), axis=-1)
@@ -247,7 +247,7 @@ def test_trajectories_of_three_coordinates_are_drawn_in_space(tmp_path: Path, dr
 def test_obstacles_are_drawn_in_space(tmp_path: Path, drawn: list[Figure]) -> None:
     wall = Box((0.25, 0.0, 0.1), (0.1, 0.4, 0.2))
     scene = Scene(to_metres, obstacles=[wall])
-    plots.plot_trajectories(tmp_path / "trajectories.png", scene=scene, pairs=[PAIR_3D])
+    figures.plot_trajectories(tmp_path / "trajectories.png", scene=scene, pairs=[PAIR_3D])
     (axis,) = drawn[0].axes
     (sides,) = (child for child in axis.collections if isinstance(child, Poly3DCollection))
     corners = np.unique(np.concatenate(faces(wall)), axis=0)
@@ -264,7 +264,7 @@ def test_obstacles_are_drawn_in_space(tmp_path: Path, drawn: list[Figure]) -> No
 
 def test_the_overview_says_which_way_collides(tmp_path: Path, drawn: list[Figure]) -> None:
     scene = scene_of((0.0, 0.0), (0.2, 0.0), maze_map=MAZE_MAP)
-    plots.plot_maze_overview(tmp_path / "overview.png", scene=scene, pair=PAIR)
+    figures.plot_maze_overview(tmp_path / "overview.png", scene=scene, pair=PAIR)
     assert [axis.get_title() for axis in drawn[0].axes] == [
         "(a) start and goal",
         "(b) density, 2 demonstrated points",
@@ -273,7 +273,7 @@ def test_the_overview_says_which_way_collides(tmp_path: Path, drawn: list[Figure
         "(e) PF2MP, same start and noise: clear",
     ]
     with pytest.raises(ValueError, match="the overview needs a maze, got another environment"):
-        plots.plot_maze_overview(tmp_path / "no.png", scene=scene_of((0.0, 0.0), (1.0, 1.0)), pair=PAIR)
+        figures.plot_maze_overview(tmp_path / "no.png", scene=scene_of((0.0, 0.0), (1.0, 1.0)), pair=PAIR)
 
 
 # Files
@@ -283,12 +283,12 @@ def test_the_overview_says_which_way_collides(tmp_path: Path, drawn: list[Figure
 def test_every_figure_has_the_colour_of_its_background(tmp_path: Path, background: str) -> None:
     scene = scene_of((0.0, 0.0), (0.3, 0.1), maze_map=MAZE_MAP)
     options: dict[str, Any] = {"scene": scene, "background": background}
-    plots.plot_lambda(tmp_path / "lambda.png", cells=lambda_cells(), background=background)
-    plots.plot_density(tmp_path / "density.png", **options)
-    plots.plot_arrows(tmp_path / "arrows.png", **options)
-    plots.plot_trajectories(tmp_path / "trajectories.png", pairs=[PAIR], **options)
-    plots.plot_trajectories(tmp_path / "space.png", pairs=[PAIR_3D], **options)
-    plots.plot_maze_overview(tmp_path / "overview.png", pair=PAIR, **options)
+    figures.plot_lambda(tmp_path / "lambda.png", cells=lambda_cells(), background=background)
+    figures.plot_density(tmp_path / "density.png", **options)
+    figures.plot_arrows(tmp_path / "arrows.png", **options)
+    figures.plot_trajectories(tmp_path / "trajectories.png", pairs=[PAIR], **options)
+    figures.plot_trajectories(tmp_path / "space.png", pairs=[PAIR_3D], **options)
+    figures.plot_maze_overview(tmp_path / "overview.png", pair=PAIR, **options)
     paths = sorted(tmp_path.iterdir())
     assert len(paths) == 6
     for path in paths:
@@ -308,7 +308,7 @@ def test_a_figure_that_cannot_be_written_leaves_nothing(
     (tmp_path / "old.png").write_bytes(b"old")
     for name in ("new.png", "old.png"):
         with pytest.raises(KeyboardInterrupt):
-            plots.plot_lambda(tmp_path / name, cells=lambda_cells())
+            figures.plot_lambda(tmp_path / name, cells=lambda_cells())
     assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("old.png", b"old")]
 
 
@@ -318,7 +318,7 @@ def test_the_flow_moves_from_noise_to_paths(tmp_path: Path) -> None:
     unguided = torch.cat([noise, noise / 2, ends])
     starts = np.zeros((2, 2))
     output = tmp_path / "new" / "flow.gif"
-    plots.animate_flow(
+    figures.animate_flow(
         output, scene=scene, unguided=unguided, guided=unguided, starts=starts, goals=None, background="dark"
     )
     assert [path.name for path in output.parent.iterdir()] == ["flow.gif"]

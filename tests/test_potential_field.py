@@ -5,9 +5,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from lerobot_pf2mp import kernel_density, kernel_sums, potential_field
-from lerobot_pf2mp.kernel_density import BANDWIDTH_RULES, leave_one_out_log_likelihood, select_bandwidth
-from lerobot_pf2mp.kernel_sums import KernelSums
+from lerobot_pf2mp import potential_field
+from lerobot_pf2mp.density import kernel_sums, kernels
+from lerobot_pf2mp.density.kernel_sums import KernelSums
+from lerobot_pf2mp.density.kernels import BANDWIDTH_RULES, leave_one_out_log_likelihood, select_bandwidth
 from lerobot_pf2mp.potential_field import PotentialField, fit
 
 # What follows is the specification in its most obvious form: all pairs at once, float64, autograd.
@@ -296,7 +297,7 @@ def test_the_leave_one_out_likelihood_does_not_depend_on_the_blocks(monkeypatch)
     points = clusters(150, 3)
     expected = leave_one_out_log_likelihood(points, 0.3)
     monkeypatch.setattr(potential_field, "PAIRS_PER_BLOCK", 1000)
-    monkeypatch.setattr(kernel_density, "PAIRS_PER_BLOCK", 1000)
+    monkeypatch.setattr(kernels, "PAIRS_PER_BLOCK", 1000)
     assert leave_one_out_log_likelihood(points, 0.3) == pytest.approx(expected, rel=1e-9)
 
 
@@ -320,7 +321,7 @@ def test_the_likelihood_rule_recovers_the_scale_of_clusters_that_scott_smooths_o
 
 def test_the_likelihood_rule_on_a_subset_is_carried_over_to_all_points():
     points = torch.randn(2000, 2)
-    of_a_subset = kernel_density._most_likely_bandwidth(points, 0.01, 3.0, n_points=300)
+    of_a_subset = kernels._most_likely_bandwidth(points, 0.01, 3.0, n_points=300)
     assert of_a_subset == pytest.approx(select_bandwidth(points, "likelihood"), rel=0.2)
 
 
@@ -453,7 +454,7 @@ def test_the_blocks_do_not_change_the_result(monkeypatch):
         return offsets, log_sums, field._offset_to_safe_anchor(a), torch.tensor(likelihood)
 
     expected = results()
-    for module in (potential_field, kernel_density, kernel_sums):
+    for module in (potential_field, kernels, kernel_sums):
         monkeypatch.setattr(module, "PAIRS_PER_BLOCK", 1000)
     for result, wanted in zip(results(), expected, strict=True):
         torch.testing.assert_close(result, wanted, rtol=1e-5, atol=1e-5)
@@ -465,7 +466,7 @@ def test_a_step_to_safety_is_part_of_the_mean_shift_and_then_of_the_way_to_the_s
     share, reach, has_extension, monkeypatch
 ):
     if not has_extension:
-        monkeypatch.setattr("lerobot_pf2mp.kernel_tree._kernel_tree", None)
+        monkeypatch.setattr("lerobot_pf2mp.density.kernel_tree._kernel_tree", None)
     points = clusters(500, 2)
     field = fit(points, threshold_quantile=0.2)
     a = (points + 3 * field.bandwidth * torch.randn_like(points)).reshape(50, 10, 2)
@@ -495,7 +496,7 @@ def test_offsets_without_a_look_at_the_values_are_the_same(monkeypatch):
     a = points + 3 * field.bandwidth * torch.randn_like(points)
     expected = field.offset_to_safe_set(a)
     assert (expected != 0).any()
-    monkeypatch.setattr("lerobot_pf2mp.kernel_tree._kernel_tree", None)
+    monkeypatch.setattr("lerobot_pf2mp.density.kernel_tree._kernel_tree", None)
     without = fit(points, threshold_quantile=0.2)
     torch.testing.assert_close(without.offset_to_safe_set(a), expected)
     assert "_safe_tree" not in vars(without)

@@ -8,7 +8,7 @@ from lerobot.processor import PolicyProcessorPipeline
 from lerobot.processor.converters import batch_to_transition, create_transition, transition_to_batch
 from torch import Tensor
 
-from lerobot_pf2mp.potential_field_processor import (
+from lerobot_pf2mp.policies.guided.potential_field_step import (
     POTENTIAL_FIELD,
     DemonstratedActions,
     FieldSettings,

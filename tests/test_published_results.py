@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_pf2mp.rate import Rate
-from lerobot_pf2mp.results import SummaryRow, group_cells, read_rows
-from lerobot_pf2mp.tables import make_latex, make_markdown
+from lerobot_pf2mp.results.rate import Rate
+from lerobot_pf2mp.results.rows import SummaryRow, group_cells, read_rows
+from lerobot_pf2mp.results.tables import make_latex, make_markdown
 
 ROOT = Path(__file__).parents[1]
 RESULTS = sorted(path.parent for path in (ROOT / "results").rglob("summary.csv"))

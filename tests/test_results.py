@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lerobot_pf2mp.rate import Rate
-from lerobot_pf2mp.results import (
+from lerobot_pf2mp.results.rate import Rate
+from lerobot_pf2mp.results.rows import (
     Cell,
     EpisodeRow,
     SummaryRow,
@@ -19,7 +19,7 @@ from lerobot_pf2mp.results import (
     summarise,
     write_rows,
 )
-from lerobot_pf2mp.tables import make_latex, make_markdown
+from lerobot_pf2mp.results.tables import make_latex, make_markdown
 
 GUIDED = {"policy": "pf2mp", "guidance_integrator": "proximal", "guidance_scale": 0.8}
 UNGUIDED = {"policy": "fmp", "guidance_integrator": "none", "guidance_scale": 0.0}

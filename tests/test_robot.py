@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from lerobot.datasets import LeRobotDataset
-from lerobot_pf2mp.dataset_tools.collect_handwriting import collect_handwriting
 
-from lerobot_pf2mp import cli
+from lerobot_pf2mp.commands import cli
+from lerobot_pf2mp.dataset_tools.handwriting.collect_handwriting import collect_handwriting
 
 pytestmark = pytest.mark.slow
 

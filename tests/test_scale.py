@@ -15,17 +15,17 @@ import torch
 import torch.distributed as dist
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.datasets import LeRobotDataset
-from lerobot_pf2mp.dataset_tools.collect_maze import collect_maze
-from lerobot_pf2mp.dataset_tools.lerobot_writer import DatasetSpec, write_dataset
 from safetensors.torch import load_file
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from lerobot_pf2mp import DPPFConfig, FMPConfig, PF2MPConfig, load_policy
-from lerobot_pf2mp.gathering import gather_rows
+from lerobot_pf2mp.dataset_tools.maze.collect_maze import collect_maze
+from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, write_dataset
 from lerobot_pf2mp.policies.dppf.modeling_dppf import DPPFPolicy
 from lerobot_pf2mp.policies.fmp.modeling_fmp import FMPPolicy
 from lerobot_pf2mp.policies.pf2mp.modeling_pf2mp import PF2MPPolicy
+from lerobot_pf2mp.training.gathering import gather_rows
 
 BIN = Path(sys.executable).parent
 FIELD_FILE = "policy_preprocessor_step_4_potential_field.safetensors"

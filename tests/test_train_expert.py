@@ -11,26 +11,26 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
-from lerobot_pf2mp.dataset_tools.attempts import successful
-from lerobot_pf2mp.dataset_tools.collect_fetch import collect_fetch
-from lerobot_pf2mp.dataset_tools.expert_algorithms import make_algorithm
-from lerobot_pf2mp.dataset_tools.expert_checkpoint import ExpertCheckpoint
-from lerobot_pf2mp.dataset_tools.expert_settings import ExpertSettings
-from lerobot_pf2mp.dataset_tools.goal_env import (
+from safetensors.torch import load_file
+from stable_baselines3.common.env_checker import check_env as check_env_of_stable_baselines3
+
+from lerobot_pf2mp.commands import cli
+from lerobot_pf2mp.dataset_tools.experts.expert_algorithms import make_algorithm
+from lerobot_pf2mp.dataset_tools.experts.expert_checkpoint import ExpertCheckpoint
+from lerobot_pf2mp.dataset_tools.experts.expert_settings import ExpertSettings
+from lerobot_pf2mp.dataset_tools.experts.goal_env import (
     EPISODE_STEPS,
     LARGEST_STEP,
     FetchGoalEnv,
     make_goal_env,
     observation_units,
 )
-from lerobot_pf2mp.dataset_tools.learned_expert import LearnedFetchExpert
-from lerobot_pf2mp.dataset_tools.train_expert import train_expert
-from safetensors.torch import load_file
-from stable_baselines3.common.env_checker import check_env as check_env_of_stable_baselines3
-
-from lerobot_pf2mp import cli
-from lerobot_pf2mp.envs.fetch import MAX_STEP, FetchEnv
-from lerobot_pf2mp.interruption import INTERRUPTED
+from lerobot_pf2mp.dataset_tools.experts.learned_expert import LearnedFetchExpert
+from lerobot_pf2mp.dataset_tools.experts.train_expert import train_expert
+from lerobot_pf2mp.dataset_tools.fetch.collect_fetch import collect_fetch
+from lerobot_pf2mp.dataset_tools.writing.attempts import successful
+from lerobot_pf2mp.envs.fetch.fetch_env import MAX_STEP, FetchEnv
+from lerobot_pf2mp.process.interruption import INTERRUPTED
 
 SMALL = {"learning_starts": 48, "batch_size": 8, "net_arch": [8], "buffer_size": 500}
 SMALL_PPO = {"n_envs": 1, "n_steps": 8, "batch_size": 8, "net_arch": [8]}
@@ -342,7 +342,7 @@ def test_without_stable_baselines3_one_line_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Callable[..., str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
-    monkeypatch.delitem(sys.modules, "lerobot_pf2mp.dataset_tools.expert_algorithms")
+    monkeypatch.delitem(sys.modules, "lerobot_pf2mp.dataset_tools.experts.expert_algorithms")
     line = refused(cli.train_expert, f"--output_dir={tmp_path / 'expert'}")
     assert line.endswith('need: pip install "lerobot_policy_pf2mp[experts]"')
     assert list(tmp_path.iterdir()) == []

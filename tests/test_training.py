@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 from lerobot.datasets import LeRobotDataset
-from lerobot_pf2mp.dataset_tools.collect_maze import collect_maze
 from safetensors.torch import load_file
 
+from lerobot_pf2mp.dataset_tools.maze.collect_maze import collect_maze
 from lerobot_pf2mp.loading import load_policy
 
 pytestmark = pytest.mark.slow

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 
-from lerobot_pf2mp import video
-from lerobot_pf2mp.plots import COLLISION, THEMES
-from lerobot_pf2mp.video import write_comparison
+from lerobot_pf2mp.figures import COLLISION, THEMES, comparison_video
+from lerobot_pf2mp.figures.comparison_video import write_comparison
 
-BANNER, GAP, N_LAST = video._BANNER, video._GAP, video._N_LAST
+BANNER, GAP, N_LAST = comparison_video._BANNER, comparison_video._GAP, comparison_video._N_LAST
 
 
 def film_of(*greys: int) -> list[np.ndarray]:
@@ -56,7 +55,7 @@ def test_a_video_that_cannot_be_written_leaves_nothing(
         path.write_bytes(b"half")
         raise OSError("no space left")
 
-    monkeypatch.setattr(video, "write_video", write_half)
+    monkeypatch.setattr(comparison_video, "write_video", write_half)
     with pytest.raises(OSError, match="no space left"):
         write_comparison(tmp_path / "v.mp4", film_of(0), film_of(0), collisions=(None, None))
     assert not list(tmp_path.iterdir())

@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from lerobot.datasets import LeRobotDataset
-from lerobot_pf2mp.dataset_tools.collect_fetch import collect_fetch
-from lerobot_pf2mp.dataset_tools.episodes import PICTURES, Trajectory, prepare
-from lerobot_pf2mp.dataset_tools.fetch_dataset import fetch_spec
-from lerobot_pf2mp.dataset_tools.fetch_expert import ScriptedFetchExpert
-from lerobot_pf2mp.dataset_tools.video_writer import has_pictures, write_video_dataset
 
-from lerobot_pf2mp.envs.fetch import FetchEnv
+from lerobot_pf2mp.dataset_tools.fetch.collect_fetch import collect_fetch
+from lerobot_pf2mp.dataset_tools.fetch.fetch_dataset import fetch_spec
+from lerobot_pf2mp.dataset_tools.fetch.fetch_expert import ScriptedFetchExpert
+from lerobot_pf2mp.dataset_tools.writing.episodes import PICTURES, Trajectory, prepare
+from lerobot_pf2mp.dataset_tools.writing.video_writer import has_pictures, write_video_dataset
+from lerobot_pf2mp.envs.fetch.fetch_env import FetchEnv
 
 SPEC = fetch_spec("reach", "local/reach", "Made up.", 6, picture_size=(48, 64))
 

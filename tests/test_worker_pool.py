@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_pf2mp.worker_pool import worker_pool
+from lerobot_pf2mp.process.worker_pool import worker_pool
 
 _offset = 0
 
@@ -60,7 +60,7 @@ def test_an_interrupted_worker_says_nothing(tmp_path: Path) -> None:
     (tmp_path / "program.py").write_text(
         """
 import os, signal
-from lerobot_pf2mp.worker_pool import worker_pool
+from lerobot_pf2mp.process.worker_pool import worker_pool
 
 def nothing(): pass
 def interrupt_oneself(): os.kill(os.getpid(), signal.SIGINT)

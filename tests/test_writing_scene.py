@@ -11,12 +11,18 @@ import numpy as np
 import pytest
 from shapely import LineString, MultiPoint, Point
 
-from lerobot_pf2mp.envs import letters
-from lerobot_pf2mp.envs.letters import LETTERS, letter_stroke
-from lerobot_pf2mp.envs.regions import Area, Disc, Region, region_of
-from lerobot_pf2mp.envs.sheet import LETTER_HEIGHT, N_REGIONS, REGION_GAP, SHEET_CENTRE, SHEET_SIDE
-from lerobot_pf2mp.envs.stroke import distances, evenly_spaced, line_of
-from lerobot_pf2mp.envs.writing_scene import WritingScene, check_on_sheet, make_writing_scene
+from lerobot_pf2mp.envs.handwriting import letters
+from lerobot_pf2mp.envs.handwriting.letters import LETTERS, letter_stroke
+from lerobot_pf2mp.envs.handwriting.regions import Area, Disc, Region, region_of
+from lerobot_pf2mp.envs.handwriting.sheet import (
+    LETTER_HEIGHT,
+    N_REGIONS,
+    REGION_GAP,
+    SHEET_CENTRE,
+    SHEET_SIDE,
+)
+from lerobot_pf2mp.envs.handwriting.stroke import distances, evenly_spaced, line_of
+from lerobot_pf2mp.envs.handwriting.writing_scene import WritingScene, check_on_sheet, make_writing_scene
 
 SPACING = 0.001  # of a scene's stroke [m]
 GRID = 0.002  # of the places of regions [m]

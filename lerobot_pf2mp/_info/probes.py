@@ -145,7 +145,7 @@ def video() -> dict[str, Any]:
 def extension() -> dict[str, Any]:
     """Whether the C extension has been built; one that cannot be loaded is an error."""
     folder = _package_folder()
-    files = [folder / f"{EXTENSION}{suffix}" for suffix in EXTENSION_SUFFIXES]
+    files = [folder / "density" / f"{EXTENSION}{suffix}" for suffix in EXTENSION_SUFFIXES]
     built = [file for file in files if file.exists()]
     for file in built[:1]:
         _module_from(file, EXTENSION)

@@ -12,7 +12,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot_pf2mp.envs.configs import PF2MPMazeEnv
 
 if TYPE_CHECKING:
-    from lerobot_pf2mp.benchmark_spec import BenchmarkSpec
+    from lerobot_pf2mp.benchmark.spec import BenchmarkSpec
 
 
 @dataclass
@@ -61,7 +61,7 @@ class BenchmarkConfig:
 
 def main(config: BenchmarkConfig) -> None:
     """Runs the command."""
-    from lerobot_pf2mp.benchmark import run_benchmark
+    from lerobot_pf2mp.benchmark.run import run_benchmark
 
     output_dir = config.output_dir.expanduser()
     run_benchmark(make_spec(config), output_dir, n_processes=config.n_processes)
@@ -70,7 +70,7 @@ def main(config: BenchmarkConfig) -> None:
 
 def make_spec(config: BenchmarkConfig) -> BenchmarkSpec:
     """What to compare, as `run_benchmark` wants it."""
-    from lerobot_pf2mp.benchmark_spec import BenchmarkSpec, Guidance
+    from lerobot_pf2mp.benchmark.spec import BenchmarkSpec, Guidance
 
     return BenchmarkSpec(
         env=config.env,

@@ -12,7 +12,7 @@ from lerobot_pf2mp.commands.publishing import published_if_asked
 from lerobot_pf2mp.commands.scene import SceneConfig
 from lerobot_pf2mp.commands.writing import WritingConfig
 from lerobot_pf2mp.envs.configs import OBS_TYPES
-from lerobot_pf2mp.envs.sheet import HANDWRITING_STEPS
+from lerobot_pf2mp.envs.handwriting.sheet import HANDWRITING_STEPS
 
 
 @dataclass
@@ -79,9 +79,9 @@ def main(config: CollectConfig) -> None:
 def _collect(config: CollectConfig) -> None:
     if config.obs_type not in OBS_TYPES:
         raise ValueError(f"obs_type must be one of {list(OBS_TYPES)}, got {config.obs_type!r}")
-    from lerobot_pf2mp.dataset_tools.fetch_dataset import FETCH_OF_TASK
-    from lerobot_pf2mp.dataset_tools.handwriting_dataset import SPACE_OF_TASK
-    from lerobot_pf2mp.dataset_tools.maze_dataset import MAZE_OF_TASK
+    from lerobot_pf2mp.dataset_tools.fetch.fetch_dataset import FETCH_OF_TASK
+    from lerobot_pf2mp.dataset_tools.handwriting.handwriting_dataset import SPACE_OF_TASK
+    from lerobot_pf2mp.dataset_tools.maze.maze_dataset import MAZE_OF_TASK
 
     if config.maze_map is not None and config.task not in MAZE_OF_TASK:
         raise ValueError(f"--maze_map is for mazes only, got {config.maze_map} for {config.task}")
@@ -101,8 +101,8 @@ def _picture_width(config: CollectConfig) -> int | None:
 
 
 def _collect_maze(config: CollectConfig) -> None:
-    from lerobot_pf2mp.dataset_tools.collect_maze import collect_maze
-    from lerobot_pf2mp.dataset_tools.maze_dataset import maze_of
+    from lerobot_pf2mp.dataset_tools.maze.collect_maze import collect_maze
+    from lerobot_pf2mp.dataset_tools.maze.maze_dataset import maze_of
 
     if config.expert != "scripted":
         raise ValueError(f"expert must be scripted for a maze, got {config.expert!r}")
@@ -118,7 +118,7 @@ def _collect_maze(config: CollectConfig) -> None:
 
 
 def _collect_fetch(config: CollectConfig, task: str) -> None:
-    from lerobot_pf2mp.dataset_tools.collect_fetch import collect_fetch
+    from lerobot_pf2mp.dataset_tools.fetch.collect_fetch import collect_fetch
 
     write = partial(
         collect_fetch,
@@ -135,7 +135,7 @@ def _collect_fetch(config: CollectConfig, task: str) -> None:
 
 
 def _collect_handwriting(config: CollectConfig, space: str) -> None:
-    from lerobot_pf2mp.dataset_tools.collect_handwriting import collect_handwriting
+    from lerobot_pf2mp.dataset_tools.handwriting.collect_handwriting import collect_handwriting
 
     if config.expert != "scripted":
         raise ValueError(f"expert must be scripted for handwriting, got {config.expert!r}")

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import draccus
 
-from lerobot_pf2mp.interruption import exit_code, sigterm_like_ctrl_c
+from lerobot_pf2mp.process.interruption import exit_code, sigterm_like_ctrl_c
 
 
 def run(config_class: type, main: Callable[[Any], None]) -> None:

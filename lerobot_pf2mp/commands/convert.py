@@ -11,7 +11,7 @@ from lerobot_pf2mp.commands.command import write_and_report
 from lerobot_pf2mp.commands.publishing import published_if_asked
 from lerobot_pf2mp.commands.scene import SceneConfig
 from lerobot_pf2mp.commands.writing import WritingConfig
-from lerobot_pf2mp.envs.sheet import HANDWRITING_STEPS
+from lerobot_pf2mp.envs.handwriting.sheet import HANDWRITING_STEPS
 
 
 @dataclass
@@ -102,11 +102,11 @@ def _convert(config: ConvertConfig) -> None:
 
 
 def _convert_maze(config: ConvertConfig, path: Path) -> None:
-    from lerobot_pf2mp.dataset_tools.convert_d4rl import read_d4rl
-    from lerobot_pf2mp.dataset_tools.convert_minari import read_minari
-    from lerobot_pf2mp.dataset_tools.fetch_dataset import FETCH_OF_TASK
-    from lerobot_pf2mp.dataset_tools.handwriting_dataset import SPACE_OF_TASK
-    from lerobot_pf2mp.dataset_tools.maze_dataset import maze_of, write_maze_dataset
+    from lerobot_pf2mp.dataset_tools.fetch.fetch_dataset import FETCH_OF_TASK
+    from lerobot_pf2mp.dataset_tools.handwriting.handwriting_dataset import SPACE_OF_TASK
+    from lerobot_pf2mp.dataset_tools.maze.convert_d4rl import read_d4rl
+    from lerobot_pf2mp.dataset_tools.maze.convert_minari import read_minari
+    from lerobot_pf2mp.dataset_tools.maze.maze_dataset import maze_of, write_maze_dataset
 
     for tasks, source_type in ((FETCH_OF_TASK, "fetch"), (SPACE_OF_TASK, "handwriting")):
         if config.task in tasks:
@@ -127,8 +127,8 @@ def _convert_maze(config: ConvertConfig, path: Path) -> None:
 
 
 def _convert_fetch(config: ConvertConfig, path: Path) -> None:
-    from lerobot_pf2mp.dataset_tools.convert_fetch import convert_fetch
-    from lerobot_pf2mp.dataset_tools.fetch_dataset import FETCH_OF_TASK
+    from lerobot_pf2mp.dataset_tools.fetch.convert_fetch import convert_fetch
+    from lerobot_pf2mp.dataset_tools.fetch.fetch_dataset import FETCH_OF_TASK
 
     if config.task not in FETCH_OF_TASK:
         raise ValueError(f"task must be one of {list(FETCH_OF_TASK)}, got {config.task!r}")
@@ -143,8 +143,8 @@ def _convert_fetch(config: ConvertConfig, path: Path) -> None:
 
 
 def _convert_handwriting(config: ConvertConfig, path: Path) -> None:
-    from lerobot_pf2mp.dataset_tools.convert_handwriting import convert_handwriting
-    from lerobot_pf2mp.dataset_tools.handwriting_dataset import SPACE_OF_TASK
+    from lerobot_pf2mp.dataset_tools.handwriting.convert_handwriting import convert_handwriting
+    from lerobot_pf2mp.dataset_tools.handwriting.handwriting_dataset import SPACE_OF_TASK
 
     if config.task not in SPACE_OF_TASK:
         raise ValueError(f"task must be one of {list(SPACE_OF_TASK)}, got {config.task!r}")

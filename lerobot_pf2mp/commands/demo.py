@@ -34,7 +34,7 @@ class DemoConfig:
 
 def main(config: DemoConfig) -> None:
     """Runs the command."""
-    from lerobot_pf2mp.demo import run_demo
+    from lerobot_pf2mp.commands.demo_stages import run_demo
 
     run_demo(
         config.output_dir.expanduser(),

@@ -57,12 +57,12 @@ class PlotConfig:
 
 def main(config: PlotConfig) -> None:
     """Runs the command."""
-    from lerobot_pf2mp import plots
-    from lerobot_pf2mp.figures import FIGURES, GuidedPolicyFigures, make_lambda_figure
+    from lerobot_pf2mp import figures
+    from lerobot_pf2mp.figures.policy_figures import FIGURES, GuidedPolicyFigures, make_lambda_figure
 
     for option, value, choices in (
         ("--figure", config.figure, FIGURES),
-        ("--background", config.background, tuple(plots.THEMES)),
+        ("--background", config.background, tuple(figures.THEMES)),
     ):
         if value not in choices:
             raise ValueError(f"{option} must be one of {choices}, got {value!r}")
@@ -81,6 +81,6 @@ def main(config: PlotConfig) -> None:
         make_lambda_figure(results, output, task=config.task, background=config.background)
     else:
         checkpoint = given("--checkpoint", config.checkpoint)
-        figures = GuidedPolicyFigures(checkpoint, config.env, seed=config.seed, options=config.options)
-        figures.draw(config.figure, output, config.n_episodes, config.episodes, config.background)
+        of_policy = GuidedPolicyFigures(checkpoint, config.env, seed=config.seed, options=config.options)
+        of_policy.draw(config.figure, output, config.n_episodes, config.episodes, config.background)
     print(f"Wrote {output}.")

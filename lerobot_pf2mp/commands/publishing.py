@@ -28,8 +28,8 @@ def published_if_asked(
             raise ValueError("--private says how to publish, which --push_to_hub=true asks for")
         yield
         return
-    from lerobot_pf2mp.publish_dataset import publish_dataset
-    from lerobot_pf2mp.publishing import check_destination
+    from lerobot_pf2mp.hub.publish_dataset import publish_dataset
+    from lerobot_pf2mp.hub.publishing import check_destination
 
     repo_id, root = dataset_place(check_destination(repo_id), root, "")
     yield

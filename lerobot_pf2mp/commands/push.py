@@ -40,7 +40,7 @@ class PushConfig:
 
 def main(config: PushConfig) -> None:
     """Runs the command."""
-    from lerobot_pf2mp.publish_checkpoint import publish_checkpoint
+    from lerobot_pf2mp.hub.publish_checkpoint import publish_checkpoint
 
     url = publish_checkpoint(
         given("--path", config.path).expanduser(),

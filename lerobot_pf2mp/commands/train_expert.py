@@ -53,8 +53,8 @@ class TrainExpertConfig:
 
 def main(config: TrainExpertConfig) -> None:
     """Runs the command."""
-    from lerobot_pf2mp.dataset_tools.fetch_dataset import FETCH_OF_TASK
-    from lerobot_pf2mp.dataset_tools.train_expert import train_expert
+    from lerobot_pf2mp.dataset_tools.experts.train_expert import train_expert
+    from lerobot_pf2mp.dataset_tools.fetch.fetch_dataset import FETCH_OF_TASK
 
     if config.task not in FETCH_OF_TASK:
         raise ValueError(f"task must be one of {list(FETCH_OF_TASK)}, got {config.task!r}")

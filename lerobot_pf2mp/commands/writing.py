@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lerobot_pf2mp.envs.sheet import LETTER_HEIGHT, N_REGIONS, REGION_GAP
+from lerobot_pf2mp.envs.handwriting.sheet import LETTER_HEIGHT, N_REGIONS, REGION_GAP
 
 
 @dataclass

@@ -14,12 +14,12 @@ from lerobot_pf2mp.envs.configs import (
     PF2MPHandwritingEnv,
     PF2MPMazeEnv,
 )
-from lerobot_pf2mp.envs.sheet import HANDWRITING_STEPS
+from lerobot_pf2mp.envs.handwriting.sheet import HANDWRITING_STEPS
 
 for _task, _maze in MAZE_TASKS.items():
     gym.register(
         id=f"lerobot_pf2mp/{_task}",
-        entry_point="lerobot_pf2mp.envs.maze:MazeEnv",
+        entry_point="lerobot_pf2mp.envs.maze.maze_env:MazeEnv",
         max_episode_steps=80,
         kwargs={"maze_map": _maze},
     )
@@ -27,7 +27,7 @@ for _task, _maze in MAZE_TASKS.items():
 for _task, _name in FETCH_TASKS.items():
     gym.register(
         id=f"lerobot_pf2mp/{_task}",
-        entry_point="lerobot_pf2mp.envs.fetch:FetchEnv",
+        entry_point="lerobot_pf2mp.envs.fetch.fetch_env:FetchEnv",
         max_episode_steps=48,
         kwargs={"task": _name},
     )
@@ -35,7 +35,7 @@ for _task, _name in FETCH_TASKS.items():
 for _task, _space in HANDWRITING_TASKS.items():
     gym.register(
         id=f"lerobot_pf2mp/{_task}",
-        entry_point="lerobot_pf2mp.envs.handwriting:HandwritingEnv",
+        entry_point="lerobot_pf2mp.envs.handwriting.handwriting_env:HandwritingEnv",
         max_episode_steps=HANDWRITING_STEPS,
         kwargs={"space": _space},
     )

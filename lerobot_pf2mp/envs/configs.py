@@ -16,19 +16,19 @@ from lerobot.envs.utils import freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_STATE
 
 from lerobot_pf2mp.envs.box import Box
-from lerobot_pf2mp.envs.fetch_scene import FETCH_FPS, check_inner_steps, make_scene
-from lerobot_pf2mp.envs.picture_size import picture_size_of
-from lerobot_pf2mp.envs.sheet import (
+from lerobot_pf2mp.envs.fetch.fetch_scene import FETCH_FPS, check_inner_steps, make_scene
+from lerobot_pf2mp.envs.handwriting.sheet import (
     HANDWRITING_FPS,
     HANDWRITING_STEPS,
     LETTER_HEIGHT,
     N_REGIONS,
     REGION_GAP,
 )
+from lerobot_pf2mp.envs.image_size import picture_size_of
 from lerobot_pf2mp.errors import ConfigError, reported_on_the_command_line
 
 if TYPE_CHECKING:
-    from lerobot_pf2mp.envs.writing_scene import WritingScene
+    from lerobot_pf2mp.envs.handwriting.writing_scene import WritingScene
 
 MAZE_TASKS = {"MazeUMaze-v0": "umaze", "MazeMedium-v0": "medium", "MazeLarge-v0": "large"}
 FETCH_TASKS = {"FetchReachWall-v0": "reach", "FetchPushWall-v0": "push"}
@@ -120,7 +120,7 @@ def _with_pixels(make_env: Callable[[], gym.Env]) -> gym.Env:
 @EnvConfig.register_subclass("pf2mp_maze")
 @dataclass
 class PF2MPMazeEnv(_CollisionEnv):
-    """The maze environments, `lerobot_pf2mp.envs.maze.MazeEnv`.
+    """The maze environments, `lerobot_pf2mp.envs.maze.maze_env.MazeEnv`.
 
     Args:
         task: MazeUMaze-v0, MazeMedium-v0 or MazeLarge-v0.
@@ -155,8 +155,8 @@ class PF2MPMazeEnv(_CollisionEnv):
 
     def _picture_size(self) -> tuple[int, int]:
         # Imported here because LeRobot imports this file for every command.
-        from lerobot_pf2mp.envs.maze_picture import MazePicture
-        from lerobot_pf2mp.envs.point_maze import parse_maze_map
+        from lerobot_pf2mp.envs.maze.maze_image import MazePicture
+        from lerobot_pf2mp.envs.maze.point_maze import parse_maze_map
 
         with reported_on_the_command_line():
             maze_map = parse_maze_map(self.maze_map or MAZE_TASKS[str(self.task)])
@@ -182,7 +182,7 @@ class PF2MPMazeEnv(_CollisionEnv):
 @EnvConfig.register_subclass("pf2mp_fetch")
 @dataclass
 class PF2MPFetchEnv(_CollisionEnv):
-    """The Fetch environments with a wall, `lerobot_pf2mp.envs.fetch.FetchEnv`.
+    """The Fetch environments with a wall, `lerobot_pf2mp.envs.fetch.fetch_env.FetchEnv`.
 
     Args:
         task: FetchReachWall-v0 or FetchPushWall-v0.
@@ -250,7 +250,7 @@ class PF2MPFetchEnv(_CollisionEnv):
 @EnvConfig.register_subclass("pf2mp_handwriting")
 @dataclass
 class PF2MPHandwritingEnv(_CollisionEnv):
-    """The handwriting environments, `lerobot_pf2mp.envs.handwriting.HandwritingEnv`.
+    """The handwriting environments, `lerobot_pf2mp.envs.handwriting.handwriting_env.HandwritingEnv`.
 
     Args:
         task: HandwritingJoint-v0 (joint positions) or HandwritingPen-v0 (places of the pen's tip).
@@ -295,7 +295,7 @@ class PF2MPHandwritingEnv(_CollisionEnv):
     def scene(self) -> WritingScene:
         """The letter and the regions [m]."""
         # Imported here because LeRobot imports this file for every command.
-        from lerobot_pf2mp.envs.writing_scene import make_writing_scene
+        from lerobot_pf2mp.envs.handwriting.writing_scene import make_writing_scene
 
         return make_writing_scene(**self._scene_options)
 

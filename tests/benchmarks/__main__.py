@@ -15,7 +15,7 @@ from figure import plot_density
 from report import make_table, write_report
 from tqdm import tqdm
 
-from lerobot_pf2mp.plots.theme import THEMES
+from lerobot_pf2mp.figures.theme import THEMES
 
 PARTS = (
     "guidance",

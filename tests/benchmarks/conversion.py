@@ -16,10 +16,10 @@ import h5py
 import numpy as np
 from harness import Row, growth_exponent, time_in_turns
 from lerobot.datasets import LeRobotDataset
-from lerobot_pf2mp.dataset_tools.lerobot_writer import DatasetSpec, write_dataset
-from lerobot_pf2mp.dataset_tools.maze_expert import MazeExpert
 
-from lerobot_pf2mp.envs.point_maze import parse_maze_map
+from lerobot_pf2mp.dataset_tools.maze.maze_expert import MazeExpert
+from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, write_dataset
+from lerobot_pf2mp.envs.maze.point_maze import parse_maze_map
 
 PART = "conversion"
 EPISODE_FRAMES = 80
@@ -44,8 +44,8 @@ _SPEC = DatasetSpec(
 _CONVERT = """
 import json, sys, time
 from pathlib import Path
-from lerobot_pf2mp.dataset_tools.convert_d4rl import read_d4rl
-from lerobot_pf2mp.dataset_tools.maze_dataset import write_maze_dataset
+from lerobot_pf2mp.dataset_tools.maze.convert_d4rl import read_d4rl
+from lerobot_pf2mp.dataset_tools.maze.maze_dataset import write_maze_dataset
 
 def peak():  # of this program alone [MB]: what getrusage says includes the one that started it
     status = Path("/proc/self/status").read_text()

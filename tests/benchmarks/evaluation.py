@@ -25,10 +25,10 @@ from maze_policies import train
 from stopwatch import Stopwatch
 
 from lerobot_pf2mp import PF2MPMazeEnv
-from lerobot_pf2mp import evaluation as pf2mp_evaluation
-from lerobot_pf2mp.benchmark import run_benchmark
-from lerobot_pf2mp.benchmark_spec import NONE, BenchmarkSpec, Guidance
-from lerobot_pf2mp.episode_recorder import EpisodeRecorder
+from lerobot_pf2mp.benchmark import evaluation as pf2mp_evaluation
+from lerobot_pf2mp.benchmark.episode_recorder import EpisodeRecorder
+from lerobot_pf2mp.benchmark.run import run_benchmark
+from lerobot_pf2mp.benchmark.spec import NONE, BenchmarkSpec, Guidance
 from lerobot_pf2mp.policies.dppf.modeling_dppf import DPPFPolicy
 from lerobot_pf2mp.policies.fmp.modeling_fmp import FMPPolicy
 

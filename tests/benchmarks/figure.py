@@ -10,7 +10,7 @@ from pathlib import Path
 
 from harness import Row
 
-from lerobot_pf2mp.plots.theme import ANCHOR, EULER, GOAL, GUIDED, START, THEMES, WIDTH, themed_figure
+from lerobot_pf2mp.figures.theme import ANCHOR, EULER, GOAL, GUIDED, START, THEMES, WIDTH, themed_figure
 
 N_QUERIES = "1e4"
 _CASE = re.compile(r"D = (\d+), (\S+) anchors, (\S+) queries")

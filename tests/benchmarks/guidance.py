@@ -18,8 +18,8 @@ from harness import Row, ratio, threads, time_in_turns
 from maze_policies import HORIZON, NAMES, PAPER, SMALL, Planner, make_planner, replay
 
 from lerobot_pf2mp.policies.guided.modeling_guided import fitted_field
+from lerobot_pf2mp.policies.guided.potential_field_step import POTENTIAL_FIELD
 from lerobot_pf2mp.potential_field import PotentialField
-from lerobot_pf2mp.potential_field_processor import POTENTIAL_FIELD
 
 BATCH_SIZES = (1, 64)
 TARGETS = {SMALL: 1.25, PAPER: 1.05}

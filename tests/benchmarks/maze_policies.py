@@ -17,12 +17,12 @@ from lerobot.policies import PreTrainedPolicy, make_pre_post_processors
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 from lerobot.policies.factory import get_policy_class
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
-from lerobot_pf2mp.dataset_tools.episodes import prepare
-from lerobot_pf2mp.dataset_tools.maze_expert import MazeExpert
 from torch import Tensor, nn
 
 from lerobot_pf2mp import DPPFConfig, FMPConfig, PF2MPConfig
-from lerobot_pf2mp.potential_field_processor import PotentialFieldProcessorStep
+from lerobot_pf2mp.dataset_tools.maze.maze_expert import MazeExpert
+from lerobot_pf2mp.dataset_tools.writing.episodes import prepare
+from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
 
 SMALL, PAPER = (32, 64, 128), (512, 256, 128)  # channels of the U-Net's levels
 NAMES = {SMALL: "small U-Net (32, 64, 128)", PAPER: "paper's U-Net (512, 256, 128)"}

@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 from harness import Row
 
-from lerobot_pf2mp.written_beside import file_written_beside
+from lerobot_pf2mp.process.atomic_files import file_written_beside
 
 PACKAGES = (
     "torch",

@@ -27,14 +27,14 @@ from tempfile import TemporaryDirectory
 
 import draccus
 from harness import Row
-from lerobot_pf2mp.dataset_tools.collect_maze import collect_maze
 from report import make_table, write_report
 from tqdm import tqdm
 
 from lerobot_pf2mp import PF2MPMazeEnv
-from lerobot_pf2mp.benchmark_spec import NONE, BenchmarkSpec, Job
-from lerobot_pf2mp.evaluation import evaluate_all
-from lerobot_pf2mp.rate import Rate
+from lerobot_pf2mp.benchmark.evaluation import evaluate_all
+from lerobot_pf2mp.benchmark.spec import NONE, BenchmarkSpec, Job
+from lerobot_pf2mp.dataset_tools.maze.collect_maze import collect_maze
+from lerobot_pf2mp.results.rate import Rate
 
 PART = "time to a policy"
 HORIZON = 80

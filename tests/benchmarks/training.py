@@ -33,16 +33,16 @@ from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 from lerobot.processor import DataProcessorPipeline
 from lerobot.scripts import lerobot_train
 from lerobot.utils.utils import cycle
-from lerobot_pf2mp.dataset_tools.collect_maze import collect_maze
 from stopwatch import Stopwatch
 from torch.utils.data import DataLoader
 from torch.utils.data.dataloader import _BaseDataLoaderIter
 
 from lerobot_pf2mp import PF2MPConfig
-from lerobot_pf2mp import train as pf2mp_train
-from lerobot_pf2mp.in_memory_dataset import InMemoryDataset
+from lerobot_pf2mp.dataset_tools.maze.collect_maze import collect_maze
 from lerobot_pf2mp.policies.fmp.modeling_fmp import FMPPolicy
 from lerobot_pf2mp.policies.guided.modeling_guided import PotentialFieldGuidance
+from lerobot_pf2mp.training import train as pf2mp_train
+from lerobot_pf2mp.training.in_memory_dataset import InMemoryDataset
 
 N_EPISODES = 300
 HORIZON = 80

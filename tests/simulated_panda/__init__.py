@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from lerobot.robots import Robot, RobotConfig
 
-from lerobot_pf2mp.envs.handwriting import HandwritingEnv
-from lerobot_pf2mp.envs.panda import JOINT_NAMES
+from lerobot_pf2mp.envs.handwriting.handwriting_env import HandwritingEnv
+from lerobot_pf2mp.envs.handwriting.panda import JOINT_NAMES
 
 KEYS = [f"{name}.pos" for name in JOINT_NAMES]
 

@@ -13,7 +13,7 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
 from lerobot_pf2mp.flow_matching import Guide
-from lerobot_pf2mp.model_card import WithModelCard
+from lerobot_pf2mp.hub.model_card import WithModelCard
 from lerobot_pf2mp.policies.dppf.configuration_dppf import DPPFConfig
 from lerobot_pf2mp.policies.guided.modeling_guided import GuidedPolicy
 from lerobot_pf2mp.policies.without_peft import WithoutPEFT

@@ -10,7 +10,7 @@ from lerobot.policies.rtc.configuration_rtc import RTCConfig
 
 from lerobot_pf2mp.errors import reported_on_the_command_line
 from lerobot_pf2mp.flow_matching import INTEGRATORS, TIME_SAMPLINGS
-from lerobot_pf2mp.fused_adamw import FusedAdamWConfig
+from lerobot_pf2mp.policies.fmp.fused_adamw import FusedAdamWConfig
 
 
 @PreTrainedConfig.register_subclass("fmp")

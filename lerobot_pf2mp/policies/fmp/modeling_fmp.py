@@ -14,13 +14,13 @@ from lerobot.policies.utils import populate_queues
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
-from lerobot_pf2mp.ema import MovingAverage
 from lerobot_pf2mp.flow_matching import Guide, flow_matching_loss, integrate, sample_time
-from lerobot_pf2mp.model_card import WithModelCard
-from lerobot_pf2mp.networks import VelocityNetwork
+from lerobot_pf2mp.hub.model_card import WithModelCard
 from lerobot_pf2mp.policies.fmp.configuration_fmp import FMPConfig
+from lerobot_pf2mp.policies.fmp.ema import MovingAverage
+from lerobot_pf2mp.policies.fmp.networks import VelocityNetwork
+from lerobot_pf2mp.policies.fmp.real_time_chunking import continuing
 from lerobot_pf2mp.policies.without_peft import WithoutPEFT
-from lerobot_pf2mp.real_time_chunking import continuing
 
 ACTION_IS_PAD = f"{ACTION}_is_pad"
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from lerobot.configs import PolicyFeature
 
 from lerobot_pf2mp.guidance import GUIDANCE_INTEGRATORS, GUIDANCE_POINTS
+from lerobot_pf2mp.policies.guided.potential_field_step import FieldSettings
 from lerobot_pf2mp.policies.guided.support_monitor import ON_UNSUPPORTED
-from lerobot_pf2mp.potential_field_processor import FieldSettings
 
 
 @dataclass

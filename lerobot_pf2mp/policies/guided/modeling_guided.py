@@ -12,11 +12,11 @@ from lerobot.utils.constants import ACTION
 from torch import Tensor
 
 from lerobot_pf2mp.flow_matching import Guide
-from lerobot_pf2mp.gathering import gather_rows
 from lerobot_pf2mp.guidance import make_guide
+from lerobot_pf2mp.policies.guided.potential_field_step import POTENTIAL_FIELD, DemonstratedActions
 from lerobot_pf2mp.policies.guided.support_monitor import SupportMonitor
 from lerobot_pf2mp.potential_field import PotentialField
-from lerobot_pf2mp.potential_field_processor import POTENTIAL_FIELD, DemonstratedActions
+from lerobot_pf2mp.training.gathering import gather_rows
 
 if TYPE_CHECKING:
     from lerobot_pf2mp.policies.dppf.configuration_dppf import DPPFConfig

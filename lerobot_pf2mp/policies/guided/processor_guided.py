@@ -7,7 +7,7 @@ from typing import Any
 from lerobot.configs import PreTrainedConfig
 from lerobot.processor import PolicyAction, PolicyProcessorPipeline, make_default_pre_post_processors
 
-from lerobot_pf2mp.potential_field_processor import PotentialFieldProcessorStep
+from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
 
 
 def make_guided_pre_post_processors(

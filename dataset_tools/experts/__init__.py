@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Experts for Fetch, trained by reinforcement learning."""

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Collects demonstrations in the Fetch environments, on several processes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_pf2mp.dataset_tools.experts.expert_checkpoint import ExpertCheckpoint
+from lerobot_pf2mp.dataset_tools.experts.learned_expert import LearnedFetchExpert, check_scene
+from lerobot_pf2mp.dataset_tools.fetch.fetch_dataset import fetch_spec
+from lerobot_pf2mp.dataset_tools.fetch.fetch_expert import STYLES, Recording, ScriptedFetchExpert
+from lerobot_pf2mp.dataset_tools.writing.attempts import successful
+from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory, resample
+from lerobot_pf2mp.dataset_tools.writing.write_trajectories import write_trajectories
+from lerobot_pf2mp.envs.fetch.fetch_env import MAX_STEP, FetchEnv
+from lerobot_pf2mp.envs.fetch.fetch_scene import make_scene
+from lerobot_pf2mp.envs.image_size import picture_size_of
+from lerobot_pf2mp.process.worker_pool import worker_pool
+
+_CHUNK = 16  # demonstrations that a process makes in one go
+
+
+def collect_fetch(
+    task: str,
+    *,
+    root: Path,
+    repo_id: str,
+    n_episodes: int,
+    n_steps: int,
+    style: str,
+    scene_changes: dict[str, Any],
+    seed: int,
+    n_processes: int,
+    overwrite: bool,
+    expert: Path | None = None,
+    picture_width: int | None = None,
+) -> tuple[int, Counter[str]]:
+    """Collects successful, collision-free demonstrations of an expert as a LeRobotDataset.
+
+    The demonstrations do not depend on the number of processes.
+
+    Args:
+        task: reach or push.
+        root: The dataset's folder.
+        repo_id: Its name, ``user/name``.
+        n_episodes: Demonstrations to write.
+        n_steps: Steps that each is resampled to.
+        style: How near the scripted expert comes to the wall, clear or hug.
+        scene_changes: Arguments of `FetchScene` that differ from the task's; None for those that do not.
+        seed: Seed of everything random.
+        n_processes: Processes side by side.
+        overwrite: Whether a dataset already there is replaced.
+        expert: Folder of an expert that `train_expert` wrote; None is the scripted one.
+        picture_width: Width of a camera's pictures [pixels], their height is three quarters of it, which are recorded
+            instead of the places of block and goal; None for no camera.
+
+    Returns:
+        The number of episodes written, and the number of those left out, by reason.
+
+    Raises:
+        ValueError: If an argument breaks its rule, or the expert almost never succeeds.
+        FileExistsError: If `root` exists and `overwrite` is false.
+        ImportError: If the expert needs Stable-Baselines3 and it is missing.
+        OSError: If the expert's folder lacks a file.
+    """
+    scene = make_scene(task, **scene_changes)
+    if style not in STYLES:
+        raise ValueError(f"style must be one of {list(STYLES)}, got {style!r}")
+    if n_processes < 1:
+        raise ValueError(f"n_processes must be at least 1, got {n_processes}")
+    if expert is None:
+        origin = f"A scripted expert moved it (style {style}, seed {seed})."
+    elif style != "clear":
+        raise ValueError(f"style is for the scripted expert only, got {style!r}")
+    else:
+        checkpoint = ExpertCheckpoint.read(expert)
+        check_scene(checkpoint, scene)
+        checkpoint.load_policy()  # an error is clearer here than in a process
+        origin = f"{checkpoint.description} moved it (seed {seed})."
+    failed: Counter[str] = Counter()
+    options: dict[str, Any] = dict(scene_changes)
+    picture_size = None
+    if picture_width is not None:
+        options |= {"render_mode": "rgb_array", "render_size": picture_width}
+        picture_size = picture_size_of(picture_width)
+    with worker_pool(n_processes, _start_worker, (task, options, style, seed, expert)) as pool:
+        attempts = (_attempt(recording, n_steps) for recording in _demonstrations(pool, n_processes))
+        n_written, dropped = write_trajectories(
+            successful(attempts, failed),
+            root=root,
+            spec=fetch_spec(task, repo_id, origin, n_steps, picture_size),
+            n_steps=n_steps,
+            collides=lambda way: False,  # contact was looked for in every physics step
+            n_episodes=n_episodes,
+            overwrite=overwrite,
+        )
+    return n_written, dropped + failed
+
+
+def _demonstrations(pool: ProcessPoolExecutor, n_processes: int) -> Iterator[Recording]:
+    """All demonstrations in their order, a few chunks ahead of the one that is asked for."""
+    ahead = [pool.submit(_work, chunk) for chunk in range(n_processes + 1)]
+    for chunk in count(len(ahead)):
+        ahead.append(pool.submit(_work, chunk))
+        yield from ahead.pop(0).result()
+
+
+def _attempt(recording: Recording, n_steps: int) -> Trajectory | str:
+    if recording.is_collision:
+        return "in collision"
+    if not recording.is_success:
+        return "without success"
+    if _largest_step(recording, n_steps) > MAX_STEP:
+        return f"too long to be repeated in {n_steps} steps"
+    objects = np.array(recording.blocks) if recording.blocks else None
+    pictures = np.array(recording.pictures) if recording.pictures else None
+    return Trajectory(np.array(recording.grips), recording.goal, objects, pictures)
+
+
+def _largest_step(recording: Recording, n_steps: int) -> float:
+    steps = np.diff(resample(np.array(recording.grips), n_steps), axis=0)
+    return float(np.linalg.norm(steps, axis=1).max())
+
+
+_expert: ScriptedFetchExpert | LearnedFetchExpert | None = None
+
+
+def _start_worker(task: str, options: dict[str, Any], style: str, seed: int, expert: Path | None) -> None:
+    global _expert
+    env = FetchEnv(task, **options)
+    _expert = (
+        ScriptedFetchExpert(env, style, seed) if expert is None else LearnedFetchExpert(env, expert, seed)
+    )
+
+
+def _work(chunk: int) -> list[Recording]:
+    assert _expert is not None  # set when the process started
+    return [_expert.demonstrate(number) for number in range(chunk * _CHUNK, (chunk + 1) * _CHUNK)]

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Turns recorded handwriting into demonstrations for the handwriting environments."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_pf2mp.dataset_tools.handwriting.handwriting_dataset import handwriting_spec
+from lerobot_pf2mp.dataset_tools.handwriting.handwriting_recording import (
+    HandwritingRecording,
+    read_handwriting,
+)
+from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory
+from lerobot_pf2mp.dataset_tools.writing.write_trajectories import write_trajectories
+from lerobot_pf2mp.envs.handwriting.handwriting_env import HandwritingEnv
+from lerobot_pf2mp.envs.handwriting.ink import INK_HEIGHT
+from lerobot_pf2mp.envs.handwriting.writing_scene import check_on_sheet
+
+
+def convert_handwriting(
+    path: Path,
+    space: str,
+    *,
+    root: Path,
+    repo_id: str,
+    n_steps: int,
+    scene_options: dict[str, Any],
+    joint_offsets: Sequence[float] = (),
+    n_episodes: int | None = None,
+    overwrite: bool = False,
+) -> tuple[int, Counter[str]]:
+    """Writes the recorded episodes that keep clear of regions and table as a LeRobotDataset.
+
+    Joint positions become places of the pen, and places joint positions with the pen upright, where the dataset is to hold
+    the other.
+
+    Args:
+        path: Of a recording, see `handwriting_recording`.
+        space: What states and actions are to be, joint or pen.
+        root: The dataset's folder.
+        repo_id: Its name, ``user/name``.
+        n_steps: Steps T that each episode is resampled to.
+        scene_options: Arguments of `make_writing_scene`; its regions must not be entered.
+        joint_offsets: Added to the seven joints of the recording [rad].
+        n_episodes: Most episodes to write; None writes all.
+        overwrite: Whether a dataset already there is replaced.
+
+    Returns:
+        The number of episodes written, and the number of those left out, by reason.
+
+    Raises:
+        FileNotFoundError: If there is no such recording.
+        FileExistsError: If `root` exists and `overwrite` is false.
+        ValueError: If an argument breaks its rule, the recording is of another layout or unit, leaves the sheet or the arm's
+            limits, or no episode is usable.
+    """
+    if n_steps < 2:
+        raise ValueError(f"n_steps must be at least 2, got {n_steps}")
+    env = HandwritingEnv("joint", control="exact", **scene_options)
+    recordings = read_handwriting(path, joint_offsets)
+    left_out: Counter[str] = Counter()
+    n_written, dropped = write_trajectories(
+        _usable(path, recordings, env, space, n_steps, left_out),
+        root=root,
+        spec=handwriting_spec(
+            space, env.scene.name, repo_id, f"Converted from {path.name} (handwriting).", n_steps
+        ),
+        n_steps=n_steps,
+        collides=lambda way: False,  # has been looked at
+        n_episodes=n_episodes,
+        n_expected=len(recordings),
+        overwrite=overwrite,
+    )
+    return n_written, dropped + left_out
+
+
+def _usable(
+    path: Path,
+    recordings: Sequence[HandwritingRecording],
+    env: HandwritingEnv,
+    space: str,
+    n_steps: int,
+    left_out: Counter[str],
+) -> Iterator[Trajectory]:
+    n_usable = 0
+    for recording in recordings:
+        joints, places, heights = _ways(recording, env, n_steps)
+        if (heights > INK_HEIGHT).any():
+            left_out["with the pen off the table"] += 1
+        elif _collides(env, joints):
+            left_out["in collision"] += 1
+        else:
+            if space == "pen":
+                check_on_sheet(places, f"the pen in {recording.name}")
+            n_usable += 1
+            yield Trajectory(joints if space == "joint" else places)
+    if not n_usable:
+        reasons = ", ".join(f"{number} {reason}" for reason, number in left_out.items())
+        raise ValueError(
+            f"a dataset must hold at least one episode, got none that is usable in {path} (left out: {reasons})"
+        )
+
+
+def _ways(
+    recording: HandwritingRecording, env: HandwritingEnv, n_steps: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Joint positions ``(T + 1, 9)``, places ``(T + 1, 2)`` and heights ``(T + 1,)`` of the pen [m]."""
+    if recording.values.shape[1] == 2:
+        check_on_sheet(recording.values, f"the pen in {recording.name}")
+        places = recording.resampled(n_steps)
+        return env.kinematics.way(places), places, np.zeros(n_steps + 1)
+    env.check_joints(recording.values, f"the joints in {recording.name}")
+    joints = recording.resampled(n_steps)
+    tips = env.kinematics.tips(joints)
+    return joints, tips[:, :2], tips[:, 2]
+
+
+def _collides(env: HandwritingEnv, joints: np.ndarray) -> bool:
+    env.reset(options={"joints": joints[0]})
+    return any(env.step(target)[-1]["is_collision"] for target in joints[1:])

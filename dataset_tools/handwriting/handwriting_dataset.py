@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What all handwriting datasets have in common: features and card."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from lerobot_pf2mp.dataset_tools.writing.episodes import PICTURES
+from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, picture_feature
+from lerobot_pf2mp.envs.handwriting.panda import JOINT_NAMES
+from lerobot_pf2mp.envs.handwriting.sheet import HANDWRITING_FPS
+
+SPACE_OF_TASK = {"handwriting_joint": "joint", "handwriting_pen": "pen"}
+
+_NAMES = {"joint": list(JOINT_NAMES), "pen": ["x", "y"]}
+_MEANING = {
+    "joint": "positions of the seven joints [rad] and the two fingers [m]",
+    "pen": "place x, y of the pen's tip [m]",
+}
+
+_CARD = """\
+---
+license: apache-2.0
+task_categories: [robotics]
+tags: [LeRobot, pf2mp, handwriting]
+---
+# {title}
+
+{description} A Franka Panda writes with a pen in MuJoCo; no demonstration enters a region or touches the table. {origin}
+
+Every demonstration has {n_steps} steps; {fps} fps.
+
+| feature | meaning |
+|---|---|
+| `observation.state` | {meaning} |
+| `action` | the next ones |
+| `observation.image` | if present: arm and sheet from the side |
+
+The frame is that of the arm's base: x forward, y to its left. Made with lerobot_policy_pf2mp.
+"""
+
+
+def handwriting_spec(
+    space: str,
+    name: str,
+    repo_id: str,
+    origin: str,
+    n_steps: int,
+    picture_size: tuple[int, int] | None = None,
+) -> DatasetSpec:
+    """What a handwriting dataset holds besides its episodes.
+
+    Args:
+        space: joint or pen.
+        name: What is written.
+        repo_id: The dataset's name, ``user/name``.
+        origin: A sentence for the card: where the demonstrations come from.
+        n_steps: Steps that each has.
+        picture_size: Height and width of a camera's pictures [pixels]; None without a camera.
+    """
+    description = f"Write {name} without entering a red region."
+    card = _CARD.format(
+        title=repo_id,
+        description=description,
+        origin=origin,
+        n_steps=n_steps,
+        fps=HANDWRITING_FPS,
+        meaning=_MEANING[space],
+    )
+    names = _NAMES[space]
+    feature: dict[str, Any] = {"dtype": "float32", "shape": (len(names),), "names": names}
+    features = {"observation.state": feature, "action": dict(feature)}
+    if picture_size is not None:
+        features[PICTURES] = picture_feature(picture_size)
+    return DatasetSpec(repo_id, HANDWRITING_FPS, features, description, card)

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Demonstrations of a ball driven through a maze, in the manner of D4RL's maze2d generator (Fu et al., 2020)."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator
+
+import numpy as np
+
+from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory
+from lerobot_pf2mp.envs.maze.point_maze import make_point_maze, step_physics
+
+WAYPOINT_RADIUS = 0.1  # [m] a waypoint counts as reached, as in D4RL
+WAYPOINT_JITTER = 0.1  # [m] waypoints lie this far off the cell centres at most, on both axes
+GOAL_JITTER = 0.25  # [m] goals and starts likewise, as PointMaze places them
+MAX_PHYSICS_STEPS = 3000  # [0.01 s]
+
+Cell = tuple[int, int]
+
+
+class MazeExpert:
+    """Drives the ball of PointMaze from goal to goal along shortest paths through cell centres.
+
+    A PD controller with clipped force, in full physics. Each goal is resampled when it is reached and the ball goes on
+    from where it is. D4RL places its goals up to 0.1 m off the cell centres; here they spread as PointMaze's do at
+    evaluation.
+
+    Args:
+        maze_map: As for `parse_maze_map`.
+        action_noise: Standard deviation of Gaussian noise on the normalised force (D4RL's noisy data uses 0.5).
+        seed: Seed of everything random.
+
+    Raises:
+        ValueError: If the noise or the seed is negative, or the map is not a maze.
+    """
+
+    def __init__(self, maze_map: str, action_noise: float, seed: int) -> None:
+        if not (np.isfinite(action_noise) and action_noise >= 0):
+            raise ValueError(f"action_noise must be finite and at least 0, got {action_noise}")
+        if seed < 0:
+            raise ValueError(f"seed must be at least 0, got {seed}")
+        self._env, _ = make_point_maze(maze_map)
+        self._maze = self._env.maze
+        self._noise = action_noise
+        self._rng = np.random.default_rng(seed)
+        rows = self._maze.maze_map
+        self._cells = [(i, j) for i, row in enumerate(rows) for j, cell in enumerate(row) if cell == 0]
+        self._is_free = set(self._cells)
+        self._place_anywhere()
+        self._n_ground_contacts = self._env.data.ncon
+        self.n_collisions = 0
+
+    def trajectories(self) -> Iterator[Trajectory]:
+        """An endless stream of collision-free trajectories, one position [m] for every 0.01 s."""
+        while True:
+            start = tuple(self._maze.cell_xy_to_rowcol(self._position()))
+            cell = self._rng.choice([c for c in self._cells if c != start])
+            goal = self._off_centre(tuple(cell), GOAL_JITTER)
+            positions = self._drive(start, tuple(cell), goal)
+            if positions is None:
+                self.n_collisions += 1
+                self._place_anywhere()
+            else:
+                yield Trajectory(np.array(positions), goal)
+
+    def _drive(self, start: Cell, cell: Cell, goal: np.ndarray) -> list[list[float]] | None:
+        """The positions on the way to the goal, or None after a collision."""
+        waypoints = [self._off_centre(c, WAYPOINT_JITTER) for c in self._shortest_path(start, cell)[1:-1]]
+        positions = [self._position().tolist()]
+        model, data = self._env.model, self._env.data
+        for waypoint in [*waypoints, goal]:
+            target = waypoint.tolist()
+            while math.dist(target, positions[-1]) > WAYPOINT_RADIUS:
+                noise = self._rng.normal(scale=self._noise, size=2) if self._noise else (0.0, 0.0)
+                step_physics(model, data, target, force_noise=noise)
+                positions.append(data.qpos.tolist())
+                # The ball always rests on the ground; any other contact is a wall within 3 mm.
+                if data.ncon > self._n_ground_contacts or len(positions) > MAX_PHYSICS_STEPS:
+                    return None
+        return positions
+
+    def _shortest_path(self, start: Cell, goal: Cell) -> list[Cell]:
+        """Breadth-first search, from the goal, so that paths to one goal agree where they meet."""
+        towards: dict[Cell, Cell] = {goal: goal}
+        queue = deque([goal])
+        while start not in towards:
+            i, j = queue.popleft()
+            for neighbour in ((i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)):
+                if neighbour in self._is_free and neighbour not in towards:
+                    towards[neighbour] = (i, j)
+                    queue.append(neighbour)
+        path = [start]
+        while path[-1] != goal:
+            path.append(towards[path[-1]])
+        return path
+
+    def _off_centre(self, cell: Cell, jitter: float) -> np.ndarray:
+        return self._maze.cell_rowcol_to_xy(np.array(cell)) + self._rng.uniform(-jitter, jitter, size=2)
+
+    def _place_anywhere(self) -> None:
+        cell = self._cells[self._rng.integers(len(self._cells))]
+        self._env.point_env.set_state(self._off_centre(cell, GOAL_JITTER), np.zeros(2))
+
+    def _position(self) -> np.ndarray:
+        return self._env.data.qpos.copy()

@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sorts an expert's attempts into demonstrations and failures."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+
+from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory
+
+# An expert that succeeds in fewer of its first attempts would take for ever.
+_N_FIRST_ATTEMPTS, _MIN_SUCCESSES = 200, 4
+
+
+def successful(attempts: Iterable[Trajectory | str], failed: Counter[str]) -> Iterator[Trajectory]:
+    """The attempts that succeeded.
+
+    Args:
+        attempts: A trajectory for each attempt that succeeded, for the others the reason why not.
+        failed: Counts the others, by reason.
+
+    Raises:
+        ValueError: If almost none of the first attempts succeeds.
+    """
+    for n_attempts, attempt in enumerate(attempts):
+        if n_attempts == _N_FIRST_ATTEMPTS and n_attempts - failed.total() < _MIN_SUCCESSES:
+            reasons = ", ".join(f"{number} {reason}" for reason, number in failed.items())
+            raise ValueError(
+                f"the expert must succeed in at least {_MIN_SUCCESSES} of its first {n_attempts} attempts, "
+                f"got {n_attempts - failed.total()} ({reasons})"
+            )
+        if isinstance(attempt, str):
+            failed[attempt] += 1
+        else:
+            yield attempt

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Turns trajectories into a LeRobotDataset, with a progress bar and a count of those left out."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Generator, Iterable
+from contextlib import closing
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory, prepare
+from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, write_dataset
+from lerobot_pf2mp.dataset_tools.writing.video_writer import has_pictures, write_video_dataset
+
+
+def write_trajectories(
+    trajectories: Iterable[Trajectory],
+    *,
+    root: Path,
+    spec: DatasetSpec,
+    n_steps: int,
+    collides: Callable[[np.ndarray], bool],
+    n_episodes: int | None = None,
+    n_expected: int | None = None,
+    overwrite: bool = False,
+) -> tuple[int, Counter[str]]:
+    """Writes the usable ones of some trajectories as a LeRobotDataset.
+
+    Args:
+        trajectories: The trajectories.
+        root: The dataset's folder.
+        spec: What the dataset holds besides its episodes; of these the features that it names are written.
+        n_steps: Steps T that each trajectory is resampled to.
+        collides: Whether a ``(T + 1, D)`` way touches an obstacle; such trajectories are left out.
+        n_episodes: Most episodes to write; None writes all.
+        n_expected: Number of trajectories, for the progress bar, if it is known.
+        overwrite: Whether a dataset already there is replaced.
+
+    Returns:
+        The number of episodes written, and the number of those left out, by reason.
+
+    Raises:
+        ValueError: If an argument breaks its rule or no trajectory is usable.
+        FileExistsError: If `root` exists and `overwrite` is false.
+    """
+    if n_steps < 2:
+        raise ValueError(f"n_steps must be at least 2, got {n_steps}")
+    if n_episodes is not None and n_episodes < 1:
+        raise ValueError(f"n_episodes must be at least 1, got {n_episodes}")
+    dropped: Counter[str] = Counter()
+    prepared = prepare(trajectories, n_steps, collides, dropped)
+    usable = islice(({key: frames[key] for key in spec.features} for frames in prepared), n_episodes)
+    # Closed here rather than by the garbage collector, so that an interrupted bar is not drawn again at the end.
+    with closing(_with_progress(usable, n_episodes or n_expected)) as episodes:
+        write = write_video_dataset if has_pictures(spec) else write_dataset
+        n_written = write(root, spec, episodes, overwrite=overwrite)
+    return n_written, dropped
+
+
+def _with_progress(
+    episodes: Iterable[dict[str, np.ndarray]], total: int | None
+) -> Generator[dict[str, np.ndarray]]:
+    yield from tqdm(episodes, total=total, desc="Writing", unit="episode", mininterval=1.0)

@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Evaluates a policy on a benchmark's episodes, one repeat at a time. Evaluation is LeRobot's own."""
+
+from __future__ import annotations
+
+import io
+import statistics
+import subprocess
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import redirect_stderr
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.envs import make_env_pre_post_processors
+from lerobot.envs.configs import EnvConfig
+from lerobot.envs.utils import NEW_ROLLOUT_OPTION, preprocess_observation
+from lerobot.policies import PreTrainedPolicy
+from lerobot.scripts.lerobot_eval import eval_policy
+
+from lerobot_pf2mp.benchmark.episode_recorder import EpisodeRecorder
+from lerobot_pf2mp.benchmark.prior_noise import seeded_prior_noise
+from lerobot_pf2mp.benchmark.spec import BenchmarkSpec, Job
+from lerobot_pf2mp.loading import load_policy
+from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
+from lerobot_pf2mp.process.worker_pool import worker_pool
+from lerobot_pf2mp.results.rows import EpisodeRow
+
+_N_LATENCY_CALLS = 11
+
+
+def evaluate_all(spec: BenchmarkSpec, jobs: Sequence[Job], n_processes: int) -> Iterator[list[EpisodeRow]]:
+    """The rows of each job, in the jobs' order.
+
+    Args:
+        spec: What is compared.
+        jobs: Its repeats.
+        n_processes: Processes side by side. With more than one, each uses one thread.
+    """
+    commit = _commit()
+    if n_processes == 1:
+        yield from map(_Evaluator(spec, commit), jobs)
+        return
+    with worker_pool(n_processes, _start_worker, (spec, commit)) as pool:
+        yield from pool.map(_work, jobs)
+
+
+def _commit() -> str:
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short=10", "HEAD"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+
+
+class _Evaluator:
+    """Evaluates jobs one after the other, keeping the last policy and environment for the next one."""
+
+    def __init__(self, spec: BenchmarkSpec, commit: str) -> None:
+        self._spec = spec
+        self._commit = commit
+        self._load = lru_cache(maxsize=1)(self._load_policy)
+        self._make_env = lru_cache(maxsize=1)(self._make_vector_env)
+
+    def __call__(self, job: Job) -> list[EpisodeRow]:
+        """The rows of a job's episodes."""
+        spec = self._spec
+        policy, preprocessor, postprocessor = self._load(job.checkpoint, job.variant)
+        env_config, env = self._make_env(job.task)
+        if isinstance(policy.config, GuidedConfig):
+            policy.config.guidance_scale = job.guidance.scale
+            if job.guidance.scale:
+                policy.config.guidance_integrator = job.guidance.integrator
+        env_preprocessor, env_postprocessor = make_env_pre_post_processors(env_config, policy.config)
+        latency = _measure_latency(env, policy, env_preprocessor, preprocessor, spec.episode_seed)
+        with (
+            seeded_prior_noise(policy, job.repeat),
+            redirect_stderr(io.StringIO()),
+        ):  # LeRobot's own progress bars
+            outcomes = eval_policy(
+                env,
+                policy,
+                env_preprocessor,
+                env_postprocessor,
+                preprocessor,
+                postprocessor,
+                spec.n_episodes,
+                start_seed=spec.episode_seed,
+            )["per_episode"]
+        episodes = env.take_episodes(spec.n_episodes)
+        return [
+            EpisodeRow(
+                task=job.task,
+                policy=job.policy,
+                guidance_integrator=job.guidance.integrator,
+                guidance_scale=job.guidance.scale,
+                variant=job.variant,
+                seed=job.seed,
+                repeat=job.repeat,
+                episode=number,
+                success=bool(outcome["success"]),
+                collision=episode.collision,
+                plan_in_wall=episode.plan_in_wall,
+                min_clearance_m=_rounded(episode.min_clearance),
+                path_length_m=_rounded(episode.path_length),
+                stroke_error_mm=_rounded(episode.stroke_error, 1000),
+                steps=episode.steps,
+                chunk_latency_ms=latency,
+                checkpoint=job.checkpoint,
+                commit=self._commit,
+            )
+            for number, (outcome, episode) in enumerate(zip(outcomes, episodes, strict=True))
+        ]
+
+    def _load_policy(self, checkpoint: str, variant: str) -> tuple[Any, Any, Any]:
+        return load_policy(checkpoint, device=self._spec.device, **self._spec.variants[variant])
+
+    def _make_vector_env(self, task: str) -> tuple[EnvConfig, EpisodeRecorder]:
+        env_config = replace(self._spec.env, task=task)
+        n_envs = min(self._spec.batch_size, self._spec.n_episodes)
+        (env,) = next(iter(env_config.create_envs(n_envs, use_async_envs=False).values())).values()
+        return env_config, EpisodeRecorder(env)
+
+
+_worker: _Evaluator | None = None
+
+
+def _start_worker(spec: BenchmarkSpec, commit: str) -> None:
+    global _worker
+    torch.set_num_threads(1)
+    _worker = _Evaluator(spec, commit)
+
+
+def _work(job: Job) -> list[EpisodeRow]:
+    assert _worker is not None  # set when the process started
+    return _worker(job)
+
+
+def _rounded(value: float | None, factor: float = 1) -> float | None:
+    return None if value is None else round(factor * value, 6)
+
+
+def _measure_latency(
+    env: EpisodeRecorder,
+    policy: PreTrainedPolicy,
+    env_preprocessor: Any,
+    preprocessor: Any,
+    episode_seed: int,
+) -> float:
+    """Median time of a call that plans a new chunk for one robot [ms]."""
+    policy.eval()
+    observation, _ = env.reset(
+        seed=[episode_seed + i for i in range(env.num_envs)], options={NEW_ROLLOUT_OPTION: True}
+    )
+    observation = preprocess_observation({key: value[:1] for key, value in observation.items()})
+    observation = preprocessor(env_preprocessor({**observation, "task": [""]}))
+    times = []
+    for _ in range(_N_LATENCY_CALLS):
+        policy.reset()
+        _wait_for(policy)
+        began = time.perf_counter()
+        with torch.inference_mode():
+            policy.select_action(dict(observation))
+        _wait_for(policy)
+        times.append(time.perf_counter() - began)
+    return round(1000 * statistics.median(times[1:]), 3)  # the first one also warms up
+
+
+def _wait_for(policy: PreTrainedPolicy) -> None:
+    if next(policy.parameters()).is_cuda:
+        torch.cuda.synchronize()

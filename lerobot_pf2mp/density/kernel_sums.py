@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sums of Gaussian kernels over anchors: their logarithm, and the kernel-weighted mean of the anchors.
+
+Three ways to the same numbers: on a CPU a walk down a tree of the anchors (kernel_tree.py); where that could not be built,
+and in a compiled graph if there is no tree yet, one attention call; on other devices softmax and sum, block by block.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor
+
+from lerobot_pf2mp.density import kernel_tree
+from lerobot_pf2mp.density.kernel_tree import KernelTree
+from lerobot_pf2mp.density.kernels import PAIRS_PER_BLOCK, log_kernels, log_sum_exp, mean
+
+# Queries and anchors further from the origin than this (many bandwidths) count as this far, or squares would overflow.
+_FARTHEST = 5e17
+
+# Exponents |q|^2 / 2h^2 up to which float32 resolves their differences to some 1e-5.
+_LARGEST_SINGLE_EXPONENT = 64.0
+
+
+@dataclass(frozen=True, eq=False)
+class KernelSums:
+    """Sums of Gaussian kernels over given anchors.
+
+    Args:
+        anchors: ``(M, D)`` float32 places of the kernels, M >= 1.
+        bandwidth: Standard deviation h > 0 of the kernels.
+    """
+
+    anchors: Tensor
+    bandwidth: float
+
+    def __call__(self, queries: Tensor) -> tuple[Tensor, Tensor]:
+        """The local means and the log sums at queries; finite everywhere, in O(M + Q) memory.
+
+        Args:
+            queries: ``(Q, D)`` float32 on the anchors' device.
+
+        Returns:
+            ``(Q, D)`` the offsets m(q) - q to m(q) = sum_i w_i x_i with w = softmax_i(-|q - x_i|^2 / 2h^2), and ``(Q,)``
+            log sum_i exp(-|q - x_i|^2 / 2h^2).
+        """
+        if not len(queries):
+            return queries, queries.new_empty(0)  # on which attention would crash
+        if self.has_tree:
+            return self.tree.sums(queries)
+        with torch.autocast(device_type=queries.device.type, enabled=False):  # it would multiply in bfloat16
+            centred = queries - self._centre
+            return (self._by_attention if queries.device.type == "cpu" else self._from_differences)(centred)
+
+    @property
+    def has_tree(self) -> bool:
+        """Whether the sums come from a walk down `tree`."""
+        is_possible = self.anchors.device.type == "cpu" and kernel_tree.is_available()
+        return is_possible and ("tree" in vars(self) or not torch.compiler.is_compiling())
+
+    @cached_property
+    def tree(self) -> KernelTree:
+        """The tree of the anchors; only where `has_tree`."""
+        return KernelTree.of(self.anchors, self.bandwidth)
+
+    def _from_differences(self, queries: Tensor) -> tuple[Tensor, Tensor]:
+        offsets, log_sums = torch.empty_like(queries), torch.empty_like(queries[:, 0])
+        n_at_once = max(1, PAIRS_PER_BLOCK // len(self.anchors))
+        for some, offset, log_sum in zip(
+            *(x.split(n_at_once) for x in (queries, offsets, log_sums)), strict=True
+        ):
+            exponents = log_kernels(some, self._centred, self.bandwidth)  # (Q, M)
+            offset.copy_(torch.softmax(exponents, dim=-1) @ self._centred - some)
+            log_sum.copy_(log_sum_exp(exponents))
+        return offsets, log_sums
+
+    def _by_attention(self, queries: Tensor) -> tuple[Tensor, Tensor]:
+        # A look at the values, on which a compiled graph would break, tells whether single precision is enough.
+        if torch.compiler.is_compiling() or not self._keys.are_resolved_in_single(queries):
+            return self._double_keys.attend(queries)
+        return self._keys.attend(queries)
+
+    # Distances are taken after centring: float32 resolves differences between points, not their common offset.
+
+    @cached_property
+    def _centre(self) -> Tensor:
+        return mean(self.anchors)  # (D,)
+
+    @cached_property
+    def _centred(self) -> Tensor:
+        return self.anchors - self._centre  # (M, D)
+
+    @cached_property
+    def _keys(self) -> _Keys:
+        return _Keys.of(self._centred, self.bandwidth)
+
+    @cached_property
+    def _double_keys(self) -> _Keys:
+        return _Keys.of(self._centred.double(), self.bandwidth)
+
+
+@dataclass(frozen=True, eq=False)
+class _Keys:
+    """Anchors as an attention call needs them, in float32 or float64.
+
+    With queries q / h, keys x / h, biases -|x|^2 / 2h^2 and values x, its output is the mean, and the normaliser of its
+    softmax is the sum, up to exp(-|q|^2 / 2h^2).
+
+    Args:
+        keys: ``(1, 1, M, D + 1)``, x / h and the bias.
+        values: ``(1, 1, M, D + 1)``, x and a zero, as values must have the keys' size.
+        bandwidth: h.
+    """
+
+    keys: Tensor
+    values: Tensor
+    bandwidth: float
+
+    @classmethod
+    def of(cls, anchors: Tensor, bandwidth: float) -> _Keys:
+        scaled = (anchors / bandwidth).clamp(-_FARTHEST, _FARTHEST)
+        bias = -0.5 * scaled.square().sum(dim=1, keepdim=True)
+        return cls(
+            torch.cat([scaled, bias], dim=1)[None, None], F.pad(anchors, (0, 1))[None, None], bandwidth
+        )
+
+    def are_resolved_in_single(self, queries: Tensor) -> bool:
+        """Whether rounding the exponents to float32 changes the weights by some 1e-5, relatively."""
+        if self._largest_exponent > _LARGEST_SINGLE_EXPONENT:
+            return False
+        return bool((queries / self.bandwidth).square().sum(dim=1).max() <= 2 * _LARGEST_SINGLE_EXPONENT)
+
+    @cached_property
+    def _largest_exponent(self) -> float:
+        return -self.keys[..., -1].min().item()
+
+    def attend(self, queries: Tensor) -> tuple[Tensor, Tensor]:
+        """What `KernelSums` returns, for float32 queries ``(Q, D)``."""
+        precise = queries.to(self.keys.dtype)
+        scaled = (precise / self.bandwidth).clamp(-_FARTHEST, _FARTHEST)
+        means, log_normalisers = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu(
+            F.pad(scaled, (0, 1), value=1.0)[None, None], self.keys, self.values, scale=1.0
+        )
+        log_sums = log_normalisers[0, 0] - 0.5 * scaled.double().square().sum(dim=1)
+        return (means[0, 0, :, :-1] - precise).float(), log_sums.float()

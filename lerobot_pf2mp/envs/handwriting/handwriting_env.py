@@ -1,0 +1,301 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Handwriting with a Panda arm: a pen draws a letter and must keep out of restricted regions."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from gymnasium import spaces
+
+from lerobot_pf2mp.envs.handwriting.ink import Ink
+from lerobot_pf2mp.envs.handwriting.panda import HOME, PEN_TIP, TABLE, check_joints, make_panda
+from lerobot_pf2mp.envs.handwriting.panda_camera import CAMERAS, PandaCamera
+from lerobot_pf2mp.envs.handwriting.pen_kinematics import PenKinematics
+from lerobot_pf2mp.envs.handwriting.sheet import (
+    HANDWRITING_FPS,
+    LETTER_HEIGHT,
+    N_REGIONS,
+    REGION_GAP,
+)
+from lerobot_pf2mp.envs.handwriting.sheet_image import draw_sheet
+from lerobot_pf2mp.envs.handwriting.writing_scene import SHEET_CORNERS, check_on_sheet, make_writing_scene
+from lerobot_pf2mp.envs.image_size import picture_size_of
+from lerobot_pf2mp.envs.obstacle import Obstacle
+
+SPACES = ("joint", "pen")
+CONTROLS = ("physics", "exact")
+START_SPREAD = 0.005  # how far from the stroke's beginning the pen starts at most, on both axes [m]
+
+_LARGEST_SWEEP = 0.02  # of a joint between two looks for contact [rad]
+_MAX_SWEEPS = 200
+_STEPS_BETWEEN_TIPS = 5  # physics steps
+
+
+class HandwritingEnv(gym.Env):
+    """A Panda arm that must draw a letter without entering restricted regions.
+
+    ## Description
+    The Franka Panda of gymnasium-robotics holds a pen over a white table, as in Sections V-D and V-E of the paper. The
+    letter, grey, and the regions, red, are on a sheet in front of it. The pen draws wherever its tip is at most 7 mm
+    above the table. The frame is that of the arm's base: x forward, y to its left [m].
+
+    ## Action space
+    ``space="joint"``: ``Box(9)``, the next positions of the seven joints [rad] and the two fingers [m]. ``space="pen"``:
+    ``Box(2)``, the next place x, y of the pen's tip [m], which inverse kinematics turns into joint positions with the pen
+    upright on the table. Values beyond the limits are moved to them.
+
+    ## Observation space
+    ``Dict``: ``agent_pos``, the positions of the joints and fingers ``(9,)``, or of the pen's tip ``(2,)``, measured.
+
+    ## Rewards
+    -1.0 on the first step in collision of an episode, 0.0 otherwise; the sum over an episode is minus its collision.
+
+    ## Information
+    ``is_success``: every place of the letter is within 0.015 m of what has been drawn, whose mean distance to the letter is
+    below 0.01 m. ``is_collision``: in this episode what was drawn has entered a region, or the arm or the pen's barrel has
+    touched the table. ``clearance``: the smallest distance on the way of this step between pen and regions, or between arm
+    and table [m], negative inside. ``stroke_error``: mean distance of what has been drawn to the letter [m].
+    ``path_length``: length of what has been drawn [m].
+
+    ## Starting state
+    The pen on the table, up to 5 mm off the beginning of the letter on both axes, the arm at rest. ``reset(options=
+    {"start": (x, y)})`` sets its place [m], ``reset(options={"joints": (9 positions)})`` the joints' [rad; m].
+
+    ## Episode end
+    After the registered number of steps. Neither a collision nor success ends it.
+
+    Args:
+        space: What observations and actions are, joint or pen.
+        letter: One of `letters.LETTERS`.
+        letter_height: [m].
+        region_gap: Between the letter and the restricted regions [m].
+        n_regions: How many regions are put into the letter's bays.
+        scene_file: A JSON file with a stroke and regions of your own instead, see `writing_scene.read_writing_scene`.
+        control: ``physics``, position controllers with gravity compensation drive the arm, 500 Hz; or ``exact``, the arm
+            reaches every action. In both the way between two actions is swept for collisions.
+        fps: Control frequency [Hz], a divisor of the physics' 500 Hz.
+        render_mode: ``rgb_array`` or None.
+        render_size: Width of the picture [pixels]; its height is three quarters of that.
+        camera: arm, from the side, or top, of the sheet.
+
+    Raises:
+        ValueError: If an argument breaks its rule.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": HANDWRITING_FPS}  # noqa: RUF012
+
+    def __init__(
+        self,
+        space: str = "joint",
+        letter: str = "S",
+        letter_height: float = LETTER_HEIGHT,
+        region_gap: float = REGION_GAP,
+        n_regions: int = N_REGIONS,
+        scene_file: str | Path | None = None,
+        control: str = "physics",
+        fps: int = HANDWRITING_FPS,
+        render_mode: str | None = None,
+        render_size: int = 640,
+        camera: str = "arm",
+    ) -> None:
+        for name, value, choices in (
+            ("space", space, SPACES),
+            ("control", control, CONTROLS),
+            ("camera", camera, tuple(CAMERAS)),
+            ("render_mode", render_mode, (None, *self.metadata["render_modes"])),
+        ):
+            if value not in choices:
+                raise ValueError(f"{name} must be one of {choices}, got {value!r}")
+        self.scene = make_writing_scene(
+            letter,
+            letter_height=letter_height,
+            region_gap=region_gap,
+            n_regions=n_regions,
+            scene_file=scene_file,
+        )
+        self.render_mode = render_mode
+        self.task = f"handwriting-{space}"
+        self.task_description = f"Write {self.scene.name} without entering a red region."
+        self._space, self._control = space, control
+        picture_size = picture_size_of(render_size)
+        self._model = make_panda(draw_sheet(self.scene), picture_size)
+        self._data = mujoco.MjData(self._model)
+        self._camera = PandaCamera(self._model, camera, picture_size)
+        self._table = Obstacle(self._model, self._data, TABLE, _movers(self._model))
+        self._tip = self._data.site(PEN_TIP).xpos  # a view
+        self.kinematics = PenKinematics(self._model)
+        self._n_substeps = _substeps(fps, self._model.opt.timestep)
+        self.metadata = {**self.metadata, "render_fps": fps}
+        self.action_space: spaces.Box = _action_space(space, self._model)
+        # In full physics a joint may be pressed a little beyond its limit, and the pen off the sheet.
+        self.observation_space = spaces.Dict(
+            {"agent_pos": spaces.Box(-np.inf, np.inf, self.action_space.shape, dtype=np.float32)}
+        )
+        self.ink = Ink(self.scene)
+        self._target = HOME.copy()
+        self._is_running = self._is_collision = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Starts an episode; see the class for the options.
+
+        Raises:
+            ValueError: If the start asked for is not on the sheet, or the joints are beyond their limits.
+        """
+        super().reset(seed=seed)
+        self._target = self._first_joints(options or {})
+        mujoco.mj_resetData(self._model, self._data)
+        self._data.qpos[:] = self._data.ctrl[:] = self._target
+        mujoco.mj_forward(self._model, self._data)
+        self.ink = Ink(self.scene)
+        self._is_running, self._is_collision = True, False
+        clearance = self.ink.draw(self._tip[None].copy())
+        return self._observation(), self._info(min(clearance, self._table.clearance()))
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        """Moves the arm to, or towards, ``(9,)`` joint positions [rad; m] or ``(2,)`` a place of the pen [m].
+
+        Raises:
+            ValueError: If the action has another shape or is not finite.
+        """
+        if not self._is_running:
+            raise gym.error.ResetNeeded("call reset() before step()")
+        target = np.asarray(action, dtype=np.float64)
+        if target.shape != self.action_space.shape or not np.isfinite(target).all():
+            raise ValueError(
+                f"an action must be {self.action_space.shape[0]} finite positions, got {np.asarray(action).tolist()}"
+            )
+        target = target.clip(self.action_space.low, self.action_space.high)
+        joints = target if self._space == "joint" else self.kinematics.joints(target)
+        move = self._move_exactly if self._control == "exact" else self._drive
+        tips, table_clearance = move(joints)
+        self._target = joints
+        ink_clearance = self.ink.draw(tips)
+        is_touching = min(table_clearance, ink_clearance) < 0
+        is_first = is_touching and not self._is_collision
+        self._is_collision |= is_touching
+        info = self._info(min(ink_clearance, table_clearance))
+        return self._observation(), -1.0 if is_first else 0.0, False, False, info
+
+    def render(self) -> np.ndarray | None:
+        """A picture ``(H, W, 3)`` uint8 of the arm, the sheet and what has been drawn.
+
+        Raises:
+            RuntimeError: If this machine cannot render; says what to install.
+        """
+        if self.render_mode is None:
+            return None
+        if not self._is_running:
+            raise gym.error.ResetNeeded("call reset() before render()")
+        return self._camera.picture(self._data, self.ink)
+
+    @property
+    def pen(self) -> np.ndarray:
+        """Position ``(3,)`` of the pen's tip [m]."""
+        return self._tip.copy()
+
+    def check_joints(self, joints: np.ndarray, name: str) -> None:
+        """Checks that ``(..., 9)`` positions of joints [rad] and fingers [m] are within the arm's limits.
+
+        Raises:
+            ValueError: If they are not.
+        """
+        check_joints(self._model, joints, name)
+
+    def close(self) -> None:
+        """Frees the camera."""
+        self._camera.close()
+
+    def _first_joints(self, options: dict[str, Any]) -> np.ndarray:
+        if options.get("joints") is not None:
+            joints = np.asarray(options["joints"], dtype=np.float64)
+            if joints.ndim != 1:
+                raise ValueError(f"joints must be 9 finite positions, got an array of shape {joints.shape}")
+            self.check_joints(joints, "joints")
+            return joints
+        start = options.get("start")
+        if start is None:
+            start = self.scene.stroke[0] + self.np_random.uniform(-START_SPREAD, START_SPREAD, 2)
+            start = start.clip(*SHEET_CORNERS)
+        start = np.asarray(start, dtype=np.float64)
+        if start.shape != (2,):
+            raise ValueError(f"start must be finite places x, y [m], got {start.tolist()}")
+        check_on_sheet(start, "start")
+        return self.kinematics.joints(start)
+
+    def _move_exactly(self, target: np.ndarray) -> tuple[np.ndarray, float]:
+        """The tip's positions ``(N, 3)`` on the way, and the smallest distance of the arm to the table [m]."""
+        start = self._data.qpos.copy()
+        n = int(np.clip(math.ceil(np.abs(target - start).max() / _LARGEST_SWEEP), 1, _MAX_SWEEPS))
+        tips, clearance = [self._tip.copy()], math.inf
+        for share in np.arange(1, n + 1) / n:
+            self._data.qpos[:] = start + share * (target - start)
+            mujoco.mj_fwdPosition(self._model, self._data)
+            clearance = min(clearance, self._table_clearance())
+            tips.append(self._tip.copy())
+        return np.array(tips), clearance
+
+    def _drive(self, target: np.ndarray) -> tuple[np.ndarray, float]:
+        """The same in full physics, while the controllers' set points move evenly to the target."""
+        before = self._target
+        tips, clearance = [self._tip.copy()], math.inf
+        for substep in range(1, self._n_substeps + 1):
+            self._data.ctrl[:] = before + substep / self._n_substeps * (target - before)
+            mujoco.mj_step(self._model, self._data)
+            if substep % _STEPS_BETWEEN_TIPS == 0:
+                tips.append(self._tip.copy())
+                clearance = min(clearance, self._table_clearance())
+            elif self._table.contact_depth() > 0:
+                clearance = min(clearance, -self._table.contact_depth())
+        # A physics step looks for contacts, and where the pen is, before it moves.
+        mujoco.mj_fwdPosition(self._model, self._data)
+        tips.append(self._tip.copy())
+        return np.array(tips), min(clearance, self._table_clearance())
+
+    def _table_clearance(self) -> float:
+        depth = self._table.contact_depth()
+        return -depth if depth > 0 else self._table.clearance()
+
+    def _observation(self) -> dict[str, np.ndarray]:
+        measured = self._data.qpos if self._space == "joint" else self._tip[:2]
+        return {"agent_pos": measured.astype(np.float32)}
+
+    def _info(self, clearance: float) -> dict[str, Any]:
+        return {
+            "is_success": self.ink.is_success,
+            "is_collision": self._is_collision,
+            "clearance": clearance,
+            "stroke_error": self.ink.error,
+            "path_length": self.ink.length,
+        }
+
+
+def _substeps(fps: int, timestep: float) -> int:
+    physics_fps = round(1 / timestep)
+    if fps < 1 or physics_fps % fps:
+        raise ValueError(f"fps must divide the physics' {physics_fps} Hz, got {fps}")
+    return physics_fps // fps
+
+
+def _action_space(space: str, model: mujoco.MjModel) -> spaces.Box:
+    if space == "joint":
+        low, high = model.jnt_range.T
+    else:
+        low, high = SHEET_CORNERS
+    return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+
+
+def _movers(model: mujoco.MjModel) -> list[int]:
+    """The geoms of the arm and the pen that can touch the table."""
+    base = model.body("panda0_link0").id
+    return [
+        geom
+        for geom in range(model.ngeom)
+        if model.geom_bodyid[geom] > base and (model.geom_contype[geom] or model.geom_conaffinity[geom])
+    ]

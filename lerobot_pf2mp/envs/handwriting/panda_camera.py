@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of the arm and of what it has drawn."""
+
+from __future__ import annotations
+
+import atexit
+import math
+import weakref
+from itertools import pairwise
+
+import mujoco
+import numpy as np
+from gymnasium.envs.mujoco.mujoco_rendering import OffScreenViewer
+
+from lerobot_pf2mp.envs.handwriting.ink import Ink
+from lerobot_pf2mp.envs.handwriting.panda import ARM_GROUP
+from lerobot_pf2mp.envs.handwriting.sheet import SHEET_CENTRE
+from lerobot_pf2mp.envs.handwriting.stroke import evenly_spaced
+from lerobot_pf2mp.envs.headless import rendering
+
+# lookat [m], distance [m], azimuth and elevation [degrees]; whether the arm is shown
+CAMERAS = {
+    "arm": ((0.40, 0.0, 0.13), 1.02, 130.0, -34.0, True),
+    "top": ((*SHEET_CENTRE, 0.0), 0.42, 90.0, -89.9, False),
+}
+
+_INK = np.array([0.05, 0.10, 0.45, 1.0], dtype=np.float32)
+_INK_WIDTH = 0.003  # [m]
+_INK_HEIGHT = 0.001  # above the table, to be seen on the sheet [m]
+_SPACING, _MAX_LINES = 0.003, 1000  # of the lines that the ink is drawn of [m]
+
+
+class PandaCamera:
+    """Renders the arm, the sheet and the ink.
+
+    Args:
+        model: Of `make_panda`.
+        view: One of `CAMERAS`.
+        picture_size: Height and width [pixels].
+    """
+
+    def __init__(self, model: mujoco.MjModel, view: str, picture_size: tuple[int, int]) -> None:
+        self._model, self._view, self._picture_size = model, CAMERAS[view], picture_size
+        self._viewer: OffScreenViewer | None = None
+
+    def picture(self, data: mujoco.MjData, ink: Ink) -> np.ndarray:
+        """A picture ``(H, W, 3)`` uint8.
+
+        Args:
+            data: The state of the model, always the same object.
+            ink: What has been drawn.
+
+        Raises:
+            RuntimeError: If this machine cannot render; says what to install.
+        """
+        with rendering():
+            if self._viewer is None:
+                self._viewer = self._make_viewer(data)
+            self._viewer.make_context_current()
+            for stroke in ink.strokes:
+                _add_ink(self._viewer, evenly_spaced(stroke, max(_SPACING, ink.length / _MAX_LINES)))
+            return self._viewer.render("rgb_array")
+
+    def close(self) -> None:
+        """Frees the renderer."""
+        if self._viewer is not None:
+            self._viewer.close()
+            self._viewer = None
+
+    def _make_viewer(self, data: mujoco.MjData) -> OffScreenViewer:
+        height, width = self._picture_size
+        # Not MuJoCo's own renderer: it chooses how to reach OpenGL when MuJoCo is imported.
+        viewer = OffScreenViewer(self._model, data, width, height, max_geom=2 * _MAX_LINES)
+        viewer.vopt.sitegroup[:] = 0
+        camera = viewer.cam
+        lookat, camera.distance, camera.azimuth, camera.elevation, shows_arm = self._view
+        viewer.vopt.geomgroup[ARM_GROUP] = shows_arm
+        camera.lookat[:] = lookat
+        # A renderer that nobody closes would complain when Python ends.
+        atexit.register(_close, weakref.ref(viewer))
+        return viewer
+
+
+def _add_ink(viewer: OffScreenViewer, places: np.ndarray) -> None:
+    for start, end in pairwise(places):
+        length = math.dist(start, end)
+        ahead = np.array([*(end - start) / length, 0.0])
+        up = np.array([0.0, 0.0, 1.0])
+        viewer.add_marker(
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+            size=np.array([_INK_WIDTH / 2, length / 2, 0.0]),
+            pos=np.array([*(start + end) / 2, _INK_HEIGHT]),
+            mat=np.stack([up, np.cross(ahead, up), ahead], axis=1).ravel(),
+            rgba=_INK,
+        )
+
+
+def _close(viewer: weakref.ref[OffScreenViewer]) -> None:
+    alive = viewer()
+    if alive is not None:
+        alive.close()

@@ -1,0 +1,278 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gathers what the figures show, from results and checkpoints."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stderr
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from lerobot.envs import make_env_pre_post_processors
+from lerobot.envs.configs import EnvConfig
+from lerobot.envs.utils import NEW_ROLLOUT_OPTION, preprocess_observation
+from lerobot.scripts.lerobot_eval import rollout
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
+from torch import Tensor
+
+from lerobot_pf2mp import figures
+from lerobot_pf2mp.benchmark.prior_noise import seeded_prior_noise
+from lerobot_pf2mp.envs.configs import MAZE_TASKS, PF2MPFetchEnv, PF2MPHandwritingEnv, PF2MPMazeEnv
+from lerobot_pf2mp.envs.maze.point_maze import parse_maze_map
+from lerobot_pf2mp.figures import Path2D, PathPair, Scene
+from lerobot_pf2mp.figures.comparison_video import write_comparison
+from lerobot_pf2mp.loading import load_policy
+from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
+from lerobot_pf2mp.policies.guided.potential_field_step import POTENTIAL_FIELD
+from lerobot_pf2mp.results.rows import SummaryRow, group_cells, read_rows
+
+FIGURES = ("lambda", "density", "arrows", "trajectories", "overview", "strokes", "flow", "video")
+
+_N_SEARCHED = 100
+
+
+def make_lambda_figure(results: Sequence[Path], output: Path, *, task: str | None, background: str) -> None:
+    """Draws rates against lambda from one or several benchmarks' ``summary.csv``.
+
+    Args:
+        results: The files, or their folders.
+        output: The PNG file to write.
+        task: Which task's results to draw; None if there is only one.
+        background: light or dark.
+
+    Raises:
+        ValueError: If the results are of several tasks and none is named, or none is guided.
+        FileNotFoundError: If there is no such file.
+    """
+    rows: list[SummaryRow] = []
+    for path in results:
+        rows += read_rows(path / "summary.csv" if path.is_dir() else path, SummaryRow)
+    figures.plot_lambda(
+        output, cells=group_cells(row for row in rows if task in (None, row.task)), background=background
+    )
+
+
+class GuidedPolicyFigures:
+    """Figures of one guided policy in one environment.
+
+    Args:
+        checkpoint: A pf2mp or dppf checkpoint.
+        env: The environment.
+        seed: Seed of the first episode; episode i has seed + i.
+        options: Changes to the policy's configuration.
+
+    Raises:
+        ValueError: If the policy has no guidance.
+    """
+
+    def __init__(
+        self, checkpoint: str | Path, env: EnvConfig, *, seed: int, options: dict[str, Any] | None = None
+    ) -> None:
+        self._policy, self._preprocess, self._postprocess = load_policy(
+            checkpoint, device="cpu", **(options or {})
+        )
+        if not isinstance(self._policy.config, GuidedConfig):
+            raise ValueError(
+                f"the checkpoint must be of type pf2mp or dppf, got {self._policy.config.type!r}"
+            )
+        self._config: Any = self._policy.config
+        self._env = env
+        self._seed = seed
+
+    def draw(
+        self, figure: str, output: Path, n_episodes: int, episodes: Sequence[int], background: str
+    ) -> None:
+        """Writes one of `FIGURES` but lambda.
+
+        Args:
+            figure: Its name.
+            output: The file to write.
+            n_episodes: How many episodes to draw if none are named; for flow, how many chunks.
+            episodes: Which episodes to draw.
+            background: light or dark.
+
+        Raises:
+            ValueError: If the figure cannot be drawn of this policy in this environment.
+        """
+        scene = self.scene()
+        if figure == "density":
+            figures.plot_density(output, scene=scene, background=background)
+        elif figure == "arrows":
+            figures.plot_arrows(output, scene=scene, background=background)
+        elif figure == "trajectories":
+            pairs = self.path_pairs(n_episodes, episodes)
+            figures.plot_trajectories(output, scene=scene, pairs=pairs, background=background)
+        elif figure == "strokes":
+            pairs = self.path_pairs(0, episodes or range(n_episodes))
+            figures.plot_strokes(output, scene=scene, pairs=pairs, background=background)
+        elif figure == "overview":
+            pair = self.path_pairs(1, episodes[:1])[0]
+            figures.plot_maze_overview(output, scene=scene, pair=pair, background=background)
+        elif figure == "video":
+            (pair,) = self.path_pairs(1, episodes[:1])
+            write_comparison(
+                output, *self.film(pair), collisions=_first_collisions(pair), background=background
+            )
+        else:
+            unguided, guided, starts, goals = self.trace_flow(n_episodes)
+            figures.animate_flow(
+                output,
+                scene=scene,
+                unguided=unguided,
+                guided=guided,
+                starts=starts,
+                goals=goals,
+                background=background,
+            )
+
+    def scene(self) -> Scene:
+        """The potential field and the map of the environment."""
+        demonstrations = self._preprocess({OBS_STATE: torch.zeros(self._config.robot_state_feature.shape)})[
+            POTENTIAL_FIELD
+        ]
+        field = demonstrations.field(self._config.field_settings)
+        env = self._env
+        if isinstance(env, PF2MPMazeEnv):
+            return Scene(self._postprocess, field, parse_maze_map(env.maze_map or MAZE_TASKS[str(env.task)]))
+        if isinstance(env, PF2MPHandwritingEnv):
+            return Scene(self._postprocess, field, writing=env.scene)
+        return Scene(self._postprocess, field, obstacles=[env.wall] if isinstance(env, PF2MPFetchEnv) else ())
+
+    def path_pairs(self, n_pairs: int, episodes: Sequence[int] = ()) -> list[PathPair]:
+        """Episodes without and with guidance, from the same start and prior noise.
+
+        Args:
+            n_pairs: How many to return.
+            episodes: Which; by default, of the first hundred, those in which guidance prevents a collision, and then
+                those with the longest way.
+        """
+        n_episodes = max(episodes) + 1 if episodes else _N_SEARCHED
+        unguided, goals = self._roll_out(n_episodes, 0.0)
+        guided, _ = self._roll_out(n_episodes, self._config.guidance_scale)
+        pairs = [PathPair(i, unguided[i], guided[i], goals[i], n_episodes) for i in range(n_episodes)]
+        if episodes:
+            return [pairs[i] for i in episodes]
+        return sorted(pairs, key=_how_telling, reverse=True)[:n_pairs]
+
+    def film(self, pair: PathPair) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Pictures ``(H, W, 3)`` uint8 of an episode, before the first and after each step, without and with guidance."""
+        films = []
+        for scale, path in ((0.0, pair.unguided), (self._config.guidance_scale, pair.guided)):
+            film: list[np.ndarray] = []
+
+            def take_picture(env: Any, film: list[np.ndarray] = film) -> None:
+                film.append(env.envs[pair.episode].render())
+
+            # Prior noise depends on how many episodes run side by side.
+            self._roll_out(pair.n_side_by_side, scale, take_picture)
+            films.append(film[: len(path.positions)])
+        return films[0], films[1]
+
+    def trace_flow(self, n_chunks: int) -> tuple[Tensor, Tensor, np.ndarray, np.ndarray | None]:
+        """One chunk for each of several episodes, step by step, without and with guidance.
+
+        Args:
+            n_chunks: Episodes B.
+
+        Returns:
+            ``(N + 1, B, T, A)`` chunks without and with guidance [normalised], ``(B, D)`` starts [m], and ``(B, D)`` goals
+            [m] or None.
+        """
+        env = self._make_env(n_chunks)
+        observation, _ = env.reset(
+            seed=[self._seed + i for i in range(n_chunks)],  # type: ignore[arg-type]
+            options={NEW_ROLLOUT_OPTION: True},
+        )
+        env.close()
+        env_preprocess, _ = make_env_pre_post_processors(self._env, self._config)
+        raw = env_preprocess({**preprocess_observation(observation), "task": [""] * n_chunks})
+        batch = self._preprocess(raw)
+        shape = (n_chunks, self._config.horizon, self._config.action_feature.shape[0])
+        noise = torch.randn(shape, generator=torch.Generator().manual_seed(self._seed))
+        traces = []
+        for guide in (None, self._policy.make_guide(batch)):
+            trace = _Trace(guide)
+            self._policy.reset()
+            self._policy.predict_action_chunk(batch, noise=noise, guide=trace)
+            traces.append(torch.stack([noise, *trace.chunks]))
+        goals = raw[OBS_ENV_STATE].numpy() if OBS_ENV_STATE in raw else None
+        return traces[0], traces[1], raw[OBS_STATE].numpy(), goals
+
+    def _make_env(self, n_envs: int) -> gym.vector.VectorEnv:
+        (env,) = next(iter(self._env.create_envs(n_envs, use_async_envs=False).values())).values()
+        return env
+
+    def _roll_out(
+        self, n_episodes: int, scale: float, film: Callable[[Any], None] | None = None
+    ) -> tuple[list[Path2D], list[np.ndarray | None]]:
+        configured = self._config.guidance_scale
+        self._config.guidance_scale = scale
+        env_processors = make_env_pre_post_processors(self._env, self._config)
+        env = self._make_env(n_episodes)
+        pens: list[np.ndarray] = []
+
+        def watch(env: Any) -> None:
+            if isinstance(self._env, PF2MPHandwritingEnv):
+                pens.append(np.array([each.unwrapped.pen[:2] for each in env.envs]))
+            if film is not None:
+                film(env)
+
+        try:
+            with (
+                seeded_prior_noise(self._policy, 0),
+                redirect_stderr(io.StringIO()),
+            ):  # LeRobot's progress bar
+                result = rollout(
+                    env,
+                    self._policy,
+                    *env_processors,
+                    self._preprocess,
+                    self._postprocess,
+                    seeds=[self._seed + i for i in range(n_episodes)],
+                    return_observations=True,
+                    render_callback=watch,
+                )
+        finally:
+            env.close()
+            self._config.guidance_scale = configured
+        observations = result["observation"]
+        lengths = result["done"].int().argmax(dim=1) + 1
+        # Joint positions are no way through a scene; the pen's are.
+        ways = np.stack(pens, axis=1) if pens else observations[OBS_STATE].numpy()
+        paths = [
+            Path2D(way[: length + 1], (rewards[:length] < 0).numpy())
+            for way, rewards, length in zip(ways, result["reward"], lengths, strict=True)
+        ]
+        has_goals = OBS_ENV_STATE in observations
+        goals = [observations[OBS_ENV_STATE][i, 0].numpy() if has_goals else None for i in range(n_episodes)]
+        return paths, goals
+
+
+class _Trace:
+    """A guide that notes every step, and leaves it to another one or unguided."""
+
+    def __init__(self, guide: Any) -> None:
+        self.chunks: list[Tensor] = []
+        self._guide = guide
+
+    def __call__(self, x_t: Tensor, x_next: Tensor, x_1: Tensor, dt: float) -> Tensor:
+        if self._guide is not None:
+            x_next = self._guide(x_t, x_next, x_1, dt)
+        self.chunks.append(x_next)
+        return x_next
+
+
+def _how_telling(pair: PathPair) -> tuple[bool, float]:
+    length = np.linalg.norm(np.diff(pair.guided.positions, axis=0), axis=1).sum()
+    return bool(pair.unguided.collisions.any() and not pair.guided.collisions.any()), float(length)
+
+
+def _first_collisions(pair: PathPair) -> tuple[int | None, int | None]:
+    """After which step each of the two first collides."""
+    steps = [np.flatnonzero(path.collisions) for path in (pair.unguided, pair.guided)]
+    first, second = (int(at[0]) + 1 if at.size else None for at in steps)
+    return first, second
