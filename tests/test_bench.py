@@ -1,21 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The harness of the speed benchmarks."""
 
-import sys
 import time
 from pathlib import Path
 
+import density
 import pytest
 import torch
+from harness import Row, growth_exponent, ratio, time_in_turns
+from report import make_overview, make_table, read_rows, write_report
 
-ROOT = Path(__file__).parents[1]
-sys.path.append(str(ROOT / "tests" / "benchmarks"))
-
-import density  # noqa: E402
-from harness import Row, growth_exponent, ratio, time_in_turns  # noqa: E402
-from report import make_overview, make_table, read_rows, write_report  # noqa: E402
-
-BENCH = ROOT / "results" / "bench"
+BENCH = Path(__file__).parents[1] / "results" / "bench"
 
 
 def test_calls_are_timed_in_turns_that_begin_with_another_one_each_round() -> None:

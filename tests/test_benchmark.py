@@ -12,14 +12,21 @@ from typing import Any
 
 import pytest
 import torch
-from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
-from lerobot.policies import make_pre_post_processors
-from lerobot.policies.act.configuration_act import ACTConfig
-from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
-from lerobot.policies.factory import get_policy_class
+from small_benchmarks import (
+    EPISODE_LENGTH,
+    EPISODE_SEED,
+    N_EPISODES,
+    UMAZE,
+    outcomes,
+    rows_of,
+    run,
+    spec_of,
+    timeless,
+)
 from torch import Tensor
+from untrained_policies import ENV, HALF_WIDTH, MAKE_CONFIG, STATE, write_checkpoint
 
-from lerobot_pf2mp import DPPFConfig, FMPConfig, PF2MPConfig, PF2MPMazeEnv, load_policy
+from lerobot_pf2mp import FMPConfig, PF2MPMazeEnv, load_policy
 from lerobot_pf2mp.benchmark import evaluation
 from lerobot_pf2mp.benchmark.run import run_benchmark
 from lerobot_pf2mp.benchmark.spec import NONE, BenchmarkSpec, Guidance
@@ -27,76 +34,13 @@ from lerobot_pf2mp.envs.maze.maze_env import MazeEnv
 from lerobot_pf2mp.errors import ConfigError
 from lerobot_pf2mp.policies.dppf.modeling_dppf import DPPFPolicy
 from lerobot_pf2mp.policies.fmp import modeling_fmp
-from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
 from lerobot_pf2mp.policies.pf2mp.modeling_pf2mp import PF2MPPolicy
-from lerobot_pf2mp.results.rows import EpisodeRow, SummaryRow, read_rows
+from lerobot_pf2mp.results.rows import SummaryRow, read_rows
 
-STATE, ENV, ACTION = "observation.state", "observation.environment_state", "action"
-UMAZE = "MazeUMaze-v0"
-HALF_WIDTH = 1.5  # of what the untrained policies' actions and observations are normalised to [m]
-EPISODE_LENGTH, N_EPISODES, EPISODE_SEED = 6, 3, 7
 COLUMNS = (
     "task,policy,guidance_integrator,guidance_scale,variant,seed,repeat,episode,success,collision,plan_in_wall,min_clearance_m,"
     "path_length_m,stroke_error_mm,steps,chunk_latency_ms,checkpoint,commit"
 )
-FEATURES: dict[str, Any] = {
-    "device": "cpu",
-    "n_action_steps": 4,
-    "input_features": {
-        STATE: PolicyFeature(FeatureType.STATE, (2,)),
-        ENV: PolicyFeature(FeatureType.ENV, (2,)),
-    },
-    "output_features": {ACTION: PolicyFeature(FeatureType.ACTION, (2,))},
-}
-U_NET: dict[str, Any] = {
-    **FEATURES,
-    "horizon": 8,
-    "down_dims": (8, 16),
-    "diffusion_step_embed_dim": 16,
-    "num_inference_steps": 2,
-}
-DENOISING: dict[str, Any] = {**U_NET, "noise_scheduler_type": "DDIM", "num_train_timesteps": 20}
-TRANSFORMER: dict[str, Any] = {
-    **FEATURES,
-    "chunk_size": 8,
-    "dim_model": 16,
-    "dim_feedforward": 16,
-    "n_heads": 2,
-    "n_encoder_layers": 1,
-    "use_vae": False,
-    "pretrained_backbone_weights": None,
-}
-MAKE_CONFIG: dict[str, Callable[[], PreTrainedConfig]] = {
-    "fmp": lambda: FMPConfig(**U_NET),
-    "pf2mp": lambda: PF2MPConfig(**U_NET),
-    "diffusion": lambda: DiffusionConfig(**DENOISING),
-    "dppf": lambda: DPPFConfig(**DENOISING),
-    "act": lambda: ACTConfig(**TRANSFORMER),
-}
-
-
-def write_checkpoint(folder: Path, kind: str, seed: int = 0) -> str:
-    """An untrained policy: its weights are those of its seed, its field covers the middle of the maze."""
-    torch.manual_seed(seed)
-    config = MAKE_CONFIG[kind]()
-    ends = {
-        "min": torch.full((2,), -HALF_WIDTH),
-        "max": torch.full((2,), HALF_WIDTH),
-        "mean": torch.zeros(2),
-        "std": torch.ones(2),
-    }
-    policy = get_policy_class(kind)(config)
-    preprocessor, postprocessor = make_pre_post_processors(
-        config, dataset_stats=dict.fromkeys((STATE, ENV, ACTION), ends)
-    )
-    for step in preprocessor.steps:
-        if isinstance(step, PotentialFieldProcessorStep):
-            step.demonstrations.observe(
-                0.3 * torch.randn(4, 8, 2), None, None, settings=config.field_settings
-            )
-    for part in (policy, preprocessor, postprocessor):
-        part.save_pretrained(folder)
-    return str(folder)
 
 
 @pytest.fixture(scope="module")
@@ -120,52 +64,6 @@ def _mazes_are_made_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(PF2MPMazeEnv, "create_envs", create_once)
         yield
-
-
-def spec_of(policies: dict[str, str], *guidances: str, **options: Any) -> BenchmarkSpec:
-    defaults: dict[str, Any] = {
-        "env": PF2MPMazeEnv(task=UMAZE, episode_length=EPISODE_LENGTH),
-        "tasks": (UMAZE,),
-        "guidances": tuple(guidance for text in guidances or ("none",) for guidance in Guidance.parse(text)),
-        "variants": {"": {}},
-        "n_repeats": 1,
-        "n_episodes": N_EPISODES,
-        "episode_seed": EPISODE_SEED,
-        "batch_size": 2,  # the last rollout has an episode too many
-    }
-    return BenchmarkSpec(policies=policies, **{**defaults, **options})
-
-
-def rows_of(folder: Path) -> list[EpisodeRow]:
-    return read_rows(folder / "episodes.csv", EpisodeRow)
-
-
-def timeless(rows: list[EpisodeRow]) -> list[EpisodeRow]:
-    """Everything but the time, which no two runs share, and the commit, which may change between them."""
-    return [replace(row, chunk_latency_ms=None, commit="") for row in rows]
-
-
-def run(spec: BenchmarkSpec, folder: Path) -> list[EpisodeRow]:
-    run_benchmark(spec, folder)
-    return timeless(rows_of(folder))
-
-
-def outcomes(rows: list[EpisodeRow], policy: str, **where: Any) -> list[tuple]:
-    """What happened in a policy's episodes."""
-    return [
-        (
-            row.task,
-            row.seed,
-            row.repeat,
-            row.episode,
-            row.success,
-            row.collision,
-            row.min_clearance_m,
-            row.path_length_m,
-        )
-        for row in rows
-        if row.policy == policy and all(getattr(row, name) == value for name, value in where.items())
-    ]
 
 
 @pytest.fixture(scope="module")

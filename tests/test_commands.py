@@ -2,7 +2,6 @@
 import json
 import os
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -11,24 +10,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from foreign_recordings import FOREIGN_LAYOUT, demonstrations, line, write_d4rl, write_pointmaze
+from forked_commands import SECONDS, ForkedCommand, run
 from lerobot.datasets import LeRobotDataset
-from test_benchmark import write_checkpoint
-from test_convert import FOREIGN_LAYOUT, demonstrations, line, write_d4rl, write_pointmaze
-from test_results import SUMMARY, UNGUIDED
+from result_rows import SUMMARY, UNGUIDED
+from untrained_policies import write_checkpoint
 
 from lerobot_pf2mp.commands import cli
 from lerobot_pf2mp.results.rows import EpisodeRow, SummaryRow, read_rows, write_rows
 
-BIN = Path(sys.executable).parent
-SECONDS = 120
 MAZES = ("maze_umaze", "maze_medium", "maze_large")
 COLLECT_SMALL = ("--task=maze_umaze", "--n_episodes=3", "--n_steps=5")
-
-
-def run(command: str, *arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [BIN / command, *arguments], cwd=cwd, capture_output=True, text=True, timeout=SECONDS, check=False
-    )
 
 
 def everything_in(folder: Path) -> list[str]:
@@ -156,11 +148,10 @@ def test_help_shows_examples_units_and_defaults(command: str, facts: list[str]) 
 def test_ctrl_c_and_sigterm_in_the_middle_of_collecting_leave_nothing_behind(
     tmp_path: Path, number: signal.Signals, code: int, metadata_begun: bool
 ) -> None:
-    process = subprocess.Popen(
-        [BIN / "pf2mp-collect", "--n_episodes=4000", f"--root={tmp_path / 'd'}"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
+    process = ForkedCommand(
+        "pf2mp-collect",
+        "--n_episodes=4000",
+        f"--root={tmp_path / 'd'}",
         env={**os.environ, "TMPDIR": str(tmp_path)},
     )
     try:

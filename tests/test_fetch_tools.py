@@ -5,7 +5,6 @@ import json
 import math
 import os
 import signal
-import subprocess
 import sys
 import time
 from collections import Counter
@@ -19,9 +18,10 @@ import gymnasium as gym
 import h5py
 import numpy as np
 import pytest
+from foreign_recordings import write_minari
+from forked_commands import ForkedCommand
 from lerobot.datasets import LeRobotDataset
 from scipy.sparse.csgraph import shortest_path
-from test_convert import write_minari
 
 from lerobot_pf2mp.commands import cli
 from lerobot_pf2mp.dataset_tools.fetch import collect_fetch as collecting
@@ -471,15 +471,10 @@ def test_an_interruption_of_collecting_leaves_nothing_behind(
 def test_ctrl_c_and_sigterm_while_fetch_is_collected_leave_nothing_behind(
     tmp_path: Path, send: Callable[[int, int], None], number: signal.Signals, code: int
 ) -> None:
-    process = subprocess.Popen(
-        [
-            Path(sys.executable).parent / "pf2mp-collect",
-            "--task=fetch_reach",
-            f"--root={tmp_path / 'd'}",
-        ],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
+    process = ForkedCommand(
+        "pf2mp-collect",
+        "--task=fetch_reach",
+        f"--root={tmp_path / 'd'}",
         start_new_session=True,
     )
     try:

@@ -10,8 +10,9 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, preprocess_observation
 from lerobot.policies import make_pre_post_processors
-from test_benchmark import EPISODE_SEED, STATE, UMAZE, spec_of, write_checkpoint
-from test_results import SUMMARY, UNGUIDED
+from result_rows import SUMMARY, UNGUIDED
+from small_benchmarks import EPISODE_SEED, UMAZE, spec_of
+from untrained_policies import STATE, write_checkpoint
 
 from lerobot_pf2mp import PF2MPConfig, PF2MPFetchEnv, PF2MPMazeEnv, load_policy
 from lerobot_pf2mp import figures as plots

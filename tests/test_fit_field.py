@@ -15,6 +15,7 @@ import pandas as pd
 import PIL.Image
 import pytest
 import torch
+from forked_commands import run_well
 from hub_server import HubServer
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.datasets import LeRobotDataset
@@ -484,24 +485,17 @@ def test_later_training_starts_the_field_afresh(folder, fitted, shown, tmp_path)
 
 @pytest.mark.slow
 def test_lerobot_train_goes_on_from_the_new_checkpoint(fitted, shown, tmp_path):
-    finished = subprocess.run(
-        [
-            BIN / "lerobot-train",
-            f"--policy.path={fitted('diffusion_of_two_frames')}",
-            "--policy.push_to_hub=false",
-            "--dataset.repo_id=local/shown",
-            f"--dataset.root={shown}",
-            "--batch_size=2",
-            "--num_workers=0",
-            "--steps=2",
-            f"--output_dir={tmp_path / 'training'}",
-        ],
-        capture_output=True,
-        text=True,
-        timeout=SECONDS,
-        check=False,
+    run_well(
+        "lerobot-train",
+        f"--policy.path={fitted('diffusion_of_two_frames')}",
+        "--policy.push_to_hub=false",
+        "--dataset.repo_id=local/shown",
+        f"--dataset.root={shown}",
+        "--batch_size=2",
+        "--num_workers=0",
+        "--steps=2",
+        f"--output_dir={tmp_path / 'training'}",
     )
-    assert finished.returncode == 0, finished.stderr[-6000:]
     trained = tmp_path / "training/checkpoints/last/pretrained_model"
     assert config_of(trained)["type"] == "dppf"
     # Two batches of two chunks of eight actions, now in the normalisation of these data.

@@ -3,7 +3,6 @@
 
 import math
 import shutil
-import sys
 import sysconfig
 from pathlib import Path
 
@@ -11,14 +10,11 @@ import numpy as np
 import pytest
 import torch
 from demonstrated_paths import brute_force, paths
+from harness import threads
 
 from lerobot_pf2mp.density import kernel_tree
 from lerobot_pf2mp.density.kernel_sums import KernelSums
 from lerobot_pf2mp.density.kernel_tree import KernelTree
-
-sys.path.append(str(Path(__file__).parent / "benchmarks"))
-
-from harness import threads
 
 CAN_BE_BUILT = shutil.which("cc") and Path(sysconfig.get_path("include"), "Python.h").exists()
 

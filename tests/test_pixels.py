@@ -2,8 +2,6 @@
 """Policies that see pictures, from demonstrations to evaluation."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import gymnasium as gym
@@ -11,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import torchvision
+from forked_commands import run_well
 from lerobot.datasets import LeRobotDataset
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, env_to_policy_features
 
@@ -22,7 +21,6 @@ from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, pict
 from lerobot_pf2mp.dataset_tools.writing.video_writer import write_video_dataset
 from lerobot_pf2mp.errors import ConfigError
 
-BIN = Path(sys.executable).parent
 WIDTH = 96
 ENVS = {
     "maze": lambda **options: PF2MPMazeEnv(task="MazeUMaze-v0", **options),
@@ -106,13 +104,6 @@ def test_a_maze_is_pictured_as_the_environment_shows_it(data: dict[str, Path]) -
     assert differs.mean() < 0.05
     first = 255 * dataset[0]["observation.image"].permute(1, 2, 0).numpy()
     assert np.abs(shown - first).max() > 80
-
-
-def run_well(command: str, *options: str) -> None:
-    finished = subprocess.run(
-        [str(BIN / command), *options], capture_output=True, text=True, timeout=400, check=False
-    )
-    assert finished.returncode == 0, finished.stdout[-2000:] + finished.stderr[-6000:]
 
 
 def train(policy: str, data: Path, output: Path, *options: str) -> Path:

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from PIL import Image
-from test_results import SUMMARY, UNGUIDED, cell
+from result_rows import SUMMARY, UNGUIDED, cell
 from torch import Tensor
 
 from lerobot_pf2mp import figures

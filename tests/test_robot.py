@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from forked_commands import ForkedCommand, run_well
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_pf2mp.commands import cli
@@ -21,7 +22,6 @@ from lerobot_pf2mp.dataset_tools.handwriting.collect_handwriting import collect_
 
 pytestmark = pytest.mark.slow
 
-BIN = Path(sys.executable).parent
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}  # where simulated_panda is
 ROBOT = ["--robot.type=simulated_panda", "--robot.discover_packages_path=simulated_panda"]
 
@@ -59,19 +59,6 @@ def demonstrated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.nda
     )
     actions = LeRobotDataset("local/data", root=folder / "data").hf_dataset.with_format("numpy")["action"][:]
     return folder / "out/checkpoints/last/pretrained_model", np.asarray(actions)
-
-
-def run_well(command: str, *options: str) -> str:
-    finished = subprocess.run(
-        [str(BIN / command), *options],
-        capture_output=True,
-        text=True,
-        timeout=400,
-        check=False,
-        env=ENVIRONMENT,
-    )
-    assert finished.returncode == 0, finished.stdout[-2000:] + finished.stderr[-6000:]
-    return finished.stdout + finished.stderr
 
 
 def distance_from_demonstrations(log: Path, demonstrated: np.ndarray) -> float:
@@ -156,13 +143,7 @@ def policy_server(folder: Path) -> Iterator[str]:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    server = subprocess.Popen(
-        [str(BIN / "pf2mp-policy-server"), f"--port={port}", "--fps=10"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        cwd=folder,
-    )
+    server = ForkedCommand("pf2mp-policy-server", f"--port={port}", "--fps=10", cwd=folder)
     try:
         deadline = time.monotonic() + 120
         while time.monotonic() < deadline and server.poll() is None:
@@ -170,7 +151,7 @@ def policy_server(folder: Path) -> Iterator[str]:
                 if client.connect_ex(("127.0.0.1", port)) == 0:
                     break
             time.sleep(0.2)
-        assert server.poll() is None, server.stdout.read()
+        assert server.poll() is None, server.read()
         yield f"127.0.0.1:{port}"
     finally:
         server.terminate()

@@ -6,13 +6,13 @@ import multiprocessing
 import re
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import torch.distributed as dist
+from forked_commands import BIN, SECONDS, run, run_well
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.datasets import LeRobotDataset
 from safetensors.torch import load_file
@@ -27,10 +27,9 @@ from lerobot_pf2mp.policies.fmp.modeling_fmp import FMPPolicy
 from lerobot_pf2mp.policies.pf2mp.modeling_pf2mp import PF2MPPolicy
 from lerobot_pf2mp.training.gathering import gather_rows
 
-BIN = Path(sys.executable).parent
 FIELD_FILE = "policy_preprocessor_step_4_potential_field.safetensors"
 # Without a GPU --multi_gpu still starts the processes, which then use gloo; --cpu alone starts only one.
-TWO_PROCESSES = ["accelerate", "launch", "--multi_gpu", "--num_processes=2", "--num_machines=1"]
+LAUNCH = ["launch", "--multi_gpu", "--num_processes=2", "--num_machines=1"]
 NETWORK = [
     "--policy.device=cpu",
     "--policy.push_to_hub=false",
@@ -48,14 +47,15 @@ NETWORK = [
 HALF_AN_EPOCH = ["--steps=24", "--save_freq=12", "--eval_steps=4", "--dataset.eval_split=0.25"]
 
 
-def run(command: str, *options: str, timeout: float = 900) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [str(BIN / command), *options], capture_output=True, text=True, timeout=timeout, check=False
+def in_two_processes(command: str, *options: str) -> str:
+    """Trains as accelerate starts it; returns what was said."""
+    finished = subprocess.run(
+        [BIN / "accelerate", *LAUNCH, BIN / command, *options],
+        capture_output=True,
+        text=True,
+        timeout=SECONDS,
+        check=False,
     )
-
-
-def run_well(*command: str) -> str:
-    finished = run(*command)
     output = finished.stdout + finished.stderr
     assert finished.returncode == 0, output[-6000:]
     return output
@@ -139,9 +139,8 @@ def one(folder: Path) -> tuple[Path, str]:
 def two(folder: Path) -> tuple[Path, str]:
     """The same with two processes and batches of 8."""
     output = folder / "two"
-    said = run_well(
-        *TWO_PROCESSES,
-        str(BIN / "lerobot-train"),
+    said = in_two_processes(
+        "lerobot-train",
         "--policy.type=pf2mp",
         *options(folder / "umaze", output),
         *NETWORK,
@@ -196,9 +195,8 @@ def test_in_memory_training_resumes_in_two_processes(two: tuple[Path, str], fold
     resumed = folder / "resumed"
     shutil.copytree(two[0], resumed, symlinks=True)
     shutil.rmtree(resumed / "checkpoints/000024")
-    said = run_well(
-        *TWO_PROCESSES,
-        str(BIN / "pf2mp-train"),
+    said = in_two_processes(
+        "pf2mp-train",
         f"--config_path={checkpoint_of(resumed, '000012') / 'train_config.json'}",
         "--resume=true",
         f"--output_dir={resumed}",

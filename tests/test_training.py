@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The stock commands from end to end, each in a process of its own."""
+"""The stock commands from end to end."""
 
 import json
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from forked_commands import run, run_well
 from lerobot.datasets import LeRobotDataset
 from safetensors.torch import load_file
 
@@ -18,7 +17,6 @@ from lerobot_pf2mp.loading import load_policy
 
 pytestmark = pytest.mark.slow
 
-BIN = Path(sys.executable).parent
 FIELD_FILE = "policy_preprocessor_step_4_potential_field.safetensors"
 TRAINING_OPTIONS = [
     "--policy.push_to_hub=false",
@@ -32,18 +30,6 @@ TRAINING_OPTIONS = [
     "--log_freq=2",
     "--seed=3",
 ]
-
-
-def run(command: str, *options: str, timeout: float = 300) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [str(BIN / command), *options], capture_output=True, text=True, timeout=timeout, check=False
-    )
-
-
-def run_well(command: str, *options: str) -> str:
-    finished = run(command, *options)
-    assert finished.returncode == 0, finished.stdout[-2000:] + finished.stderr[-6000:]
-    return finished.stdout + finished.stderr
 
 
 def train(command: str, data: Path, output: Path, *options: str, policy: str = "pf2mp") -> Path:

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -193,7 +194,7 @@ print(held("VmHWM") - before)
     ):
         used = []
         for n_anchors, n_queries in sizes:
-            command = [sys.executable, "-c", code, str(n_anchors), str(n_queries), sys.path[0]]
+            command = [sys.executable, "-c", code, str(n_anchors), str(n_queries), str(Path(__file__).parent)]
             used.append(float(subprocess.run(command, capture_output=True, text=True, check=True).stdout))
             pairs = n_anchors * n_queries * 4 / 2**20
             label = f"D = 3, {n_anchors:.0e} anchors, {n_queries:.0e} queries".replace("e+0", "e")
