@@ -1,11 +1,15 @@
 # Every target sets up .venv by itself; a second call starts at once.
-.PHONY: demo test check bench tables clean
+.PHONY: demo test test-fast check bench tables clean
 
 demo: .venv/installed
 	.venv/bin/pf2mp-demo --output_dir=demo
 
+# Two processes, each of which takes whole files.
 test: .venv/installed
-	.venv/bin/python -m pytest
+	.venv/bin/pytest --numprocesses=2 --dist=loadfile --durations=20
+
+test-fast: .venv/installed
+	.venv/bin/pytest --numprocesses=2 --dist=loadfile --durations=20 -m "not slow"
 
 check: .venv/installed
 	.venv/bin/ruff check .

@@ -199,6 +199,9 @@ def _be_the_command(
     os.chdir(cwd)
     os.environ.clear()
     os.environ.update(env)
+    multiprocessing.set_forkserver_preload(
+        _IMPORTED_BEFORE
+    )  # for environments side by side, which it starts itself
     np.random.seed()  # all forks would draw the same numbers
     sys.argv = [str(BIN / arguments[0]), *arguments[1:]]
     sys.modules["__main__"] = types.ModuleType(

@@ -9,6 +9,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -322,13 +323,13 @@ def collect(task: str, root: Path, **changes: Any) -> tuple[int, Counter[str]]:
 
 
 def given(monkeypatch: pytest.MonkeyPatch, recordings: Iterator[Recording]) -> None:
-    """Lets `collect_fetch` take demonstrations from here rather than from other processes."""
-    monkeypatch.setattr(collecting, "_demonstrations", lambda pool, n_processes: recordings)
+    """Lets `collect_fetch` take demonstrations from here rather than from an expert."""
+    monkeypatch.setattr(collecting, "_demonstrations", lambda *_: nullcontext(recordings))
 
 
 @pytest.fixture(scope="module")
 def collected(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """The folder of a dataset; that of Reach was collected by another process, as always."""
+    """The folder of a dataset; that of Reach was collected by the expert, as always."""
     folder = tmp_path_factory.mktemp("collected")
 
     def collected(task: str) -> Path:
@@ -417,6 +418,12 @@ def test_replaying_collected_actions_reaches_the_goal_without_touching_the_wall(
     assert outcomes[True, False] >= 0.95 * N_COLLECTED, outcomes
 
 
+def test_one_process_is_this_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # What would start others is gone.
+    monkeypatch.delattr(collecting, "worker_pool")
+    assert collect("reach", tmp_path / "d", n_episodes=1)[0] == 1
+
+
 @pytest.mark.slow
 def test_the_number_of_processes_changes_no_byte(collected: Callable[[str], Path], tmp_path: Path) -> None:
     collect("reach", tmp_path / "d", n_processes=2)
@@ -474,6 +481,7 @@ def test_ctrl_c_and_sigterm_while_fetch_is_collected_leave_nothing_behind(
     process = ForkedCommand(
         "pf2mp-collect",
         "--task=fetch_reach",
+        "--n_processes=2",
         f"--root={tmp_path / 'd'}",
         start_new_session=True,
     )

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The distribution, as built, is found by LeRobot's plug-in discovery."""
 
+import importlib
+import itertools
+import re
 import subprocess
 import sys
 import sysconfig
@@ -13,6 +16,9 @@ import draccus
 import pytest
 import yaml
 from lerobot.configs.train import TrainPipelineConfig
+from lerobot.utils.import_utils import register_third_party_plugins
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from lerobot_pf2mp import DPPFConfig, PF2MPConfig, PF2MPFetchEnv, PF2MPHandwritingEnv, PF2MPMazeEnv
 from lerobot_pf2mp.commands.benchmark import BenchmarkConfig, make_spec
@@ -43,17 +49,30 @@ HORIZONS = {"maze": 80, "fetch": 48, "handwriting": 64}
 ENVS = {"maze": PF2MPMazeEnv, "fetch": PF2MPFetchEnv, "handwriting": PF2MPHandwritingEnv}
 
 
-def test_distribution_name_is_one_that_lerobot_looks_for() -> None:
+def test_distribution_name_is_one_that_lerobot_looks_for(monkeypatch: pytest.MonkeyPatch) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert project["name"] == "lerobot_policy_pf2mp"
+    looked_for: list[str] = []
+    with monkeypatch.context() as patch:
+        patch.setattr(importlib, "import_module", looked_for.append)
+        register_third_party_plugins()
+    assert project["name"] in looked_for
 
 
 def test_constraints_hold_names_and_versions_only() -> None:
-    for line in (ROOT / "constraints.txt").read_text().splitlines():
-        name, _, version = line.partition("==")
-        assert name, line
-        assert version, line
-        assert not set(line) & set("/:@ "), line
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    assert [
+        line for line in lines if not re.fullmatch(r"[a-z0-9]+([-._][a-z0-9]+)*==[0-9]+(\.[a-z0-9]+)*", line)
+    ] == []
+    names = [line.partition("==")[0] for line in lines]
+    assert len(set(names)) == len(names)
+
+
+def test_constraints_name_every_package_that_is_asked_for() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    requirements = [*project["dependencies"], *itertools.chain(*project["optional-dependencies"].values())]
+    asked_for = {canonicalize_name(Requirement(text).name) for text in requirements}
+    constrained = {line.partition("==")[0] for line in (ROOT / "constraints.txt").read_text().splitlines()}
+    assert asked_for - constrained == {canonicalize_name(project["name"])}
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "eval_configs").rglob("*.yaml")), ids=lambda path: path.stem)

@@ -3,6 +3,8 @@
 
 import json
 import shutil
+import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,9 @@ from forked_commands import run, run_well
 from lerobot.datasets import LeRobotDataset
 from safetensors.torch import load_file
 
+from lerobot_pf2mp.commands import cli
 from lerobot_pf2mp.dataset_tools.maze.collect_maze import collect_maze
+from lerobot_pf2mp.figures import policy_figures
 from lerobot_pf2mp.loading import load_policy
 
 pytestmark = pytest.mark.slow
@@ -46,7 +50,16 @@ def train(command: str, data: Path, output: Path, *options: str, policy: str = "
     return output / "checkpoints/last/pretrained_model"
 
 
-def evaluate(checkpoint: Path, output: Path, *options: str) -> dict:
+@dataclass(frozen=True)
+class Evaluation:
+    """What lerobot-eval leaves of some episodes."""
+
+    sum_rewards: list[float]
+    successes: list[bool]
+    videos: list[bytes]  # which show the ways, by the millimetre
+
+
+def evaluate(checkpoint: Path, output: Path, *options: str) -> Evaluation:
     run_well(
         "lerobot-eval",
         f"--policy.path={checkpoint}",
@@ -58,7 +71,9 @@ def evaluate(checkpoint: Path, output: Path, *options: str) -> dict:
         f"--output_dir={output}",
         *options,
     )
-    return json.loads((output / "eval_info.json").read_text())["per_task"][0]["metrics"]
+    metrics = json.loads((output / "eval_info.json").read_text())["per_task"][0]["metrics"]
+    videos = [path.read_bytes() for path in sorted(output.rglob("*.mp4"))]
+    return Evaluation(metrics["sum_rewards"], metrics["successes"], videos)
 
 
 def all_actions(data: Path) -> np.ndarray:
@@ -114,23 +129,30 @@ def test_stock_training_writes_weights_processors_and_field(checkpoint: Path, fo
     assert len(np.unique(points, axis=0)) > 100  # 4 batches of 8 chunks of up to 16 actions
 
 
-@pytest.mark.parametrize("use_async_envs", ["false", "true"])
-def test_stock_evaluation_needs_no_option_to_be_guided(
-    checkpoint: Path, folder: Path, use_async_envs: str
-) -> None:
-    options = [f"--eval.use_async_envs={use_async_envs}", "--seed=5"]
-    metrics = evaluate(checkpoint, folder / f"eval_{use_async_envs}", *options)
-    assert len(metrics["successes"]) == 3
-    assert set(metrics["sum_rewards"]) <= {0.0, -1.0}
+@pytest.fixture(scope="module")
+def evaluations(checkpoint: Path, folder: Path) -> dict[str, Evaluation]:
+    """The checkpoint in the same three episodes: guided, twice, and with guidance off."""
+    return {
+        name: evaluate(checkpoint, folder / f"eval_{name}", *options)
+        for name, options in {
+            "sync": ["--eval.use_async_envs=false"],
+            "async": ["--eval.use_async_envs=true"],
+            "unguided": ["--eval.use_async_envs=false", "--policy.guidance_scale=0"],
+        }.items()
+    }
 
 
-def test_sync_and_async_evaluation_agree(folder: Path, checkpoint: Path) -> None:
-    results = [
-        json.loads((folder / f"eval_{kind}/eval_info.json").read_text())["per_task"][0]["metrics"]
-        for kind in ("false", "true")
-    ]
-    assert results[0]["sum_rewards"] == results[1]["sum_rewards"]
-    assert results[0]["successes"] == results[1]["successes"]
+@pytest.mark.parametrize("kind", ["sync", "async"])
+def test_stock_evaluation_needs_no_option_to_be_guided(evaluations: dict[str, Evaluation], kind: str) -> None:
+    guided, unguided = evaluations[kind], evaluations["unguided"]
+    assert len(guided.successes) == len(guided.videos) == 3
+    assert set(guided.sum_rewards) <= {0.0, -1.0}
+    # The same starts, goals and noise, and in each episode another way.
+    assert [video for video in guided.videos if video in unguided.videos] == []
+
+
+def test_sync_and_async_evaluation_agree(evaluations: dict[str, Evaluation]) -> None:
+    assert evaluations["sync"] == evaluations["async"]
 
 
 def test_a_reloaded_checkpoint_acts_like_the_policy_that_was_saved(checkpoint: Path, tmp_path: Path) -> None:
@@ -152,7 +174,9 @@ def test_a_reloaded_checkpoint_acts_like_the_policy_that_was_saved(checkpoint: P
     )
 
 
-def test_guidance_scale_zero_on_the_command_line_is_fmp(checkpoint: Path, folder: Path) -> None:
+def test_guidance_scale_zero_on_the_command_line_is_fmp(
+    checkpoint: Path, folder: Path, evaluations: dict[str, Evaluation]
+) -> None:
     as_fmp = folder / "as_fmp"
     shutil.copytree(checkpoint, as_fmp)
     config = json.loads((as_fmp / "config.json").read_text())
@@ -170,10 +194,7 @@ def test_guidance_scale_zero_on_the_command_line_is_fmp(checkpoint: Path, folder
         chunks.append(policy.predict_action_chunk(preprocess(dict(batch)), noise=noise))
     assert torch.equal(*chunks)
     fmp = evaluate(as_fmp, folder / "eval_fmp", "--eval.use_async_envs=false")
-    off = evaluate(
-        checkpoint, folder / "eval_off", "--eval.use_async_envs=false", "--policy.guidance_scale=0"
-    )
-    assert (fmp["sum_rewards"], fmp["successes"]) == (off["sum_rewards"], off["successes"])
+    assert fmp == evaluations["unguided"]
 
 
 def test_resuming_restores_field_and_average_bit_for_bit(checkpoint: Path, folder: Path) -> None:
@@ -332,7 +353,9 @@ def test_an_evaluation_config_works_with_the_stock_command(checkpoint: Path, fol
     assert (output / "eval_info.json").exists()
 
 
-def test_the_demo_runs_resumes_and_refuses_other_options(tmp_path: Path) -> None:
+def test_the_demo_runs_resumes_and_refuses_other_options(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     options = [
         f"--output_dir={tmp_path / 'demo'}",
         "--task=maze_umaze",
@@ -340,7 +363,11 @@ def test_the_demo_runs_resumes_and_refuses_other_options(tmp_path: Path) -> None
         "--steps=3",
         "--n_episodes=4",
     ]
-    first = run_well("pf2mp-demo", *options)
+    with monkeypatch.context() as patch:
+        patch.setattr(policy_figures, "_N_SEARCHED", 4)  # episodes played for the figure
+        patch.setattr(sys, "argv", ["pf2mp-demo", *options])
+        cli.demo()
+    first = capfd.readouterr().out
     assert "| fmp |" in first
     assert "| pf2mp |" in first
     assert (tmp_path / "demo/overview.png").stat().st_size > 10_000

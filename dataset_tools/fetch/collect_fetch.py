@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Collects demonstrations in the Fetch environments, on several processes."""
+"""Collects demonstrations in the Fetch environments, on one process or several."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing, contextmanager
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -55,7 +56,7 @@ def collect_fetch(
         style: How near the scripted expert comes to the wall, clear or hug.
         scene_changes: Arguments of `FetchScene` that differ from the task's; None for those that do not.
         seed: Seed of everything random.
-        n_processes: Processes side by side.
+        n_processes: Processes side by side; 1 is this one.
         overwrite: Whether a dataset already there is replaced.
         expert: Folder of an expert that `train_expert` wrote; None is the scripted one.
         picture_width: Width of a camera's pictures [pixels], their height is three quarters of it, which are recorded
@@ -90,8 +91,8 @@ def collect_fetch(
     if picture_width is not None:
         options |= {"render_mode": "rgb_array", "render_size": picture_width}
         picture_size = picture_size_of(picture_width)
-    with worker_pool(n_processes, _start_worker, (task, options, style, seed, expert)) as pool:
-        attempts = (_attempt(recording, n_steps) for recording in _demonstrations(pool, n_processes))
+    with _demonstrations(n_processes, task, options, style, seed, expert) as recordings:
+        attempts = (_attempt(recording, n_steps) for recording in recordings)
         n_written, dropped = write_trajectories(
             successful(attempts, failed),
             root=root,
@@ -104,7 +105,20 @@ def collect_fetch(
     return n_written, dropped + failed
 
 
-def _demonstrations(pool: ProcessPoolExecutor, n_processes: int) -> Iterator[Recording]:
+@contextmanager
+def _demonstrations(
+    n_processes: int, task: str, options: dict[str, Any], style: str, seed: int, expert: Path | None
+) -> Iterator[Iterator[Recording]]:
+    """All demonstrations in their order."""
+    if n_processes == 1:
+        with closing(FetchEnv(task, **options)) as env:
+            yield map(_make_expert(env, style, seed, expert).demonstrate, count())
+    else:
+        with worker_pool(n_processes, _start_worker, (task, options, style, seed, expert)) as pool:
+            yield _side_by_side(pool, n_processes)
+
+
+def _side_by_side(pool: ProcessPoolExecutor, n_processes: int) -> Iterator[Recording]:
     """All demonstrations in their order, a few chunks ahead of the one that is asked for."""
     ahead = [pool.submit(_work, chunk) for chunk in range(n_processes + 1)]
     for chunk in count(len(ahead)):
@@ -129,15 +143,18 @@ def _largest_step(recording: Recording, n_steps: int) -> float:
     return float(np.linalg.norm(steps, axis=1).max())
 
 
+def _make_expert(
+    env: FetchEnv, style: str, seed: int, expert: Path | None
+) -> ScriptedFetchExpert | LearnedFetchExpert:
+    return ScriptedFetchExpert(env, style, seed) if expert is None else LearnedFetchExpert(env, expert, seed)
+
+
 _expert: ScriptedFetchExpert | LearnedFetchExpert | None = None
 
 
 def _start_worker(task: str, options: dict[str, Any], style: str, seed: int, expert: Path | None) -> None:
     global _expert
-    env = FetchEnv(task, **options)
-    _expert = (
-        ScriptedFetchExpert(env, style, seed) if expert is None else LearnedFetchExpert(env, expert, seed)
-    )
+    _expert = _make_expert(FetchEnv(task, **options), style, seed, expert)
 
 
 def _work(chunk: int) -> list[Recording]:
