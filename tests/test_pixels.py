@@ -85,7 +85,9 @@ def test_demonstrations_hold_the_pictures_of_their_environment_and_nothing_more(
     seen = [key for key in dataset.features if key.startswith("observation.")]
     assert seen == ["observation.state", "observation.image"]
     height, width, _ = ENVS[name](obs_type="pixels_agent_pos", render_size=WIDTH).features["pixels"].shape
-    assert dataset[0]["observation.image"].shape == (3, height, width)
+    picture = dataset[0]["observation.image"]
+    assert picture.shape == (3, height, width)
+    assert picture.max() - picture.min() > 0.2  # something is to be seen
 
 
 @pytest.mark.slow
@@ -96,14 +98,14 @@ def test_a_maze_is_pictured_as_the_environment_shows_it(data: dict[str, Path]) -
     )
     end = dataset[19]["action"].numpy()
     env.reset(seed=0, options={"start": dataset[0]["observation.state"].numpy(), "goal": end})
-    for i in range(12):
+    pictures = [255 * dataset[i]["observation.image"].permute(1, 2, 0).numpy() for i in range(20)]
+    for i in range(20):
+        differs = [(np.abs(picture - env.render()).max(axis=-1) > 80).mean() for picture in pictures]
+        # The goal of the demonstration is near its end, but not there.
+        assert differs[i] < 0.005
+        # The ball moves from the third picture on, and no picture of another moment shows it where it is now.
+        assert i < 2 or np.argmin(differs) == i
         env.step(dataset[i]["action"].numpy())
-    shown = 255 * dataset[12]["observation.image"].permute(1, 2, 0).numpy()
-    # The goal of the demonstration is near its end, but not there.
-    differs = np.abs(shown - env.render()).max(axis=-1) > 80
-    assert differs.mean() < 0.05
-    first = 255 * dataset[0]["observation.image"].permute(1, 2, 0).numpy()
-    assert np.abs(shown - first).max() > 80
 
 
 def train(policy: str, data: Path, output: Path, *options: str) -> Path:
@@ -125,6 +127,26 @@ def train(policy: str, data: Path, output: Path, *options: str) -> Path:
         *options,
     )
     return output / "checkpoints/last/pretrained_model"
+
+
+def keys_that_matter(checkpoint: Path) -> list[str]:
+    """The observations that change what the loaded policy plans with the same noise."""
+    policy, preprocess, _ = load_policy(checkpoint, device="cpu")
+    shapes = {key: feature.shape for key, feature in policy.config.input_features.items()}
+    seen = {key: torch.rand(shape) for key, shape in shapes.items()}
+    noise = torch.zeros(1, policy.config.horizon, *policy.config.output_features["action"].shape)
+
+    def plan(changed: str | None) -> torch.Tensor:
+        policy.reset()
+        observation = {key: 1 - value if key == changed else value for key, value in seen.items()}
+        with torch.inference_mode():
+            chunk = policy.predict_action_chunk(preprocess(observation), noise=noise)
+        assert torch.isfinite(chunk).all()
+        return chunk
+
+    unchanged = plan(None)
+    assert torch.equal(plan(None), unchanged)
+    return [key for key in seen if not torch.equal(plan(key), unchanged)]
 
 
 @pytest.mark.slow
@@ -164,8 +186,12 @@ def test_a_policy_with_pictures_trains_saves_loads_and_evaluates(
         "--eval.use_async_envs=false",
         f"--output_dir={tmp_path / 'eval'}",
     )
-    metrics = json.loads((tmp_path / "eval/eval_info.json").read_text())["overall"]
-    assert metrics["n_episodes"] == 2
+    (metrics,) = (
+        task["metrics"] for task in json.loads((tmp_path / "eval/eval_info.json").read_text())["per_task"]
+    )
+    assert set(metrics["sum_rewards"]) <= {0.0, -1.0}
+    assert len(metrics["successes"]) == len(list((tmp_path / "eval").rglob("*.mp4"))) == 2
+    assert keys_that_matter(checkpoint) == ["observation.state", "observation.image"]
 
 
 @pytest.mark.slow
@@ -187,19 +213,7 @@ def test_a_policy_sees_every_camera_of_a_dataset(tmp_path: Path) -> None:
     root = tmp_path / "two"
     write_video_dataset(root, DatasetSpec("local/two", 10, features, "Do it.", "A card."), episodes)
     checkpoint = train("pf2mp", root, tmp_path / "out", "--policy.n_obs_steps=2")
-    policy, preprocess, _ = load_policy(checkpoint, device="cpu")
-    seen = {"observation.state": torch.zeros(2), **{camera: torch.rand(3, 64, 80) for camera in cameras}}
-    noise = torch.zeros(1, 8, 2)
-    chunks = []
-    for changed in (None, *cameras):
-        observation = dict(seen)
-        if changed:
-            observation[changed] = 1 - seen[changed]
-        policy.reset()
-        with torch.inference_mode():
-            chunks.append(policy.predict_action_chunk(preprocess(observation), noise=noise))
-    assert not torch.equal(chunks[0], chunks[1])
-    assert not torch.equal(chunks[0], chunks[2])
+    assert keys_that_matter(checkpoint) == ["observation.state", *cameras]
 
 
 @pytest.mark.slow
@@ -222,5 +236,11 @@ def test_a_pretrained_backbone_is_torchvisions(data: dict[str, Path], tmp_path: 
             "--policy.n_obs_steps=1",
         )
         policy, *_ = load_policy(checkpoint, device="cpu")
-    first = next(value for key, value in policy.state_dict().items() if value.shape == (64, 3, 7, 7))
-    torch.testing.assert_close(first, weights["conv1.weight"], atol=1e-5, rtol=0)
+    filters = [
+        value
+        for key, value in policy.state_dict().items()
+        if key.startswith("network.") and ".backbone." in key and value.ndim == 4
+    ]
+    expected = [value for value in weights.values() if value.ndim == 4]
+    assert len(expected) == 20
+    torch.testing.assert_close(filters, expected, atol=1e-5, rtol=0)
