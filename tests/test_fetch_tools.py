@@ -4,6 +4,7 @@ import itertools
 import json
 import math
 import os
+import re
 import signal
 import sys
 import time
@@ -487,10 +488,11 @@ def test_ctrl_c_and_sigterm_while_fetch_is_collected_leave_nothing_behind(
     )
     try:
         end = time.monotonic() + SECONDS
-        while not any(tmp_path.glob(".d.*.partial/new/data/chunk-000/*.parquet")):
+        while not re.search(r"\| [1-9]\d*/1000 ", process.read()[1]):  # as the progress bar says
             assert process.poll() is None, process.communicate()
             assert time.monotonic() < end
             time.sleep(0.05)
+        assert everything_in(tmp_path) != []
         send(process.pid, number)
         output, errors = process.communicate(timeout=SECONDS)
     finally:

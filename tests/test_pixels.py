@@ -46,6 +46,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         n_processes=1,
         **common,
     )
+    # A picture of the arm takes 0.2 s without a graphics card.
+    common["n_episodes"] = 1
     collect_handwriting(
         "pen", root=roots["handwriting"], repo_id="local/handwriting", n_steps=64, scene_options={}, **common
     )

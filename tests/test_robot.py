@@ -4,6 +4,7 @@
 import json
 import os
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -14,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from forked_commands import ForkedCommand, run_well
+from forked_commands import SECONDS, ForkedCommand, run_well
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_pf2mp.commands import cli
@@ -23,7 +24,6 @@ from lerobot_pf2mp.dataset_tools.handwriting.collect_handwriting import collect_
 pytestmark = pytest.mark.slow
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}  # where simulated_panda is
-ROBOT = ["--robot.type=simulated_panda", "--robot.discover_packages_path=simulated_panda"]
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +69,34 @@ def distance_from_demonstrations(log: Path, demonstrated: np.ndarray) -> float:
     return float(gaps.min(axis=1).mean())
 
 
+def roll_out(checkpoint: Path, log: Path, *options: str, n_actions: int) -> None:
+    """Lets the robot act, at 10 Hz, and interrupts it after so many actions."""
+    rollout = ForkedCommand(
+        "lerobot-rollout",
+        f"--policy.path={checkpoint}",
+        "--device=cpu",
+        "--robot.type=simulated_panda",
+        "--robot.discover_packages_path=simulated_panda",
+        f"--robot.log={log}",
+        "--fps=10",
+        f"--duration={SECONDS}",
+        "--play_sounds=false",
+        "--return_to_initial_position=false",
+        *options,
+    )
+    try:
+        end = time.monotonic() + SECONDS
+        while not log.exists() or log.read_text().count("\n") < n_actions:
+            assert rollout.poll() is None, rollout.read()
+            assert time.monotonic() < end
+            time.sleep(0.1)
+        rollout.send_signal(signal.SIGINT)
+        said = rollout.communicate(SECONDS)
+    finally:
+        rollout.kill()
+    assert rollout.returncode == 0, said
+
+
 def test_a_rollout_moves_the_arm_and_guidance_keeps_it_near_the_demonstrations(
     demonstrated: tuple[Path, np.ndarray], tmp_path: Path
 ) -> None:
@@ -76,18 +104,7 @@ def test_a_rollout_moves_the_arm_and_guidance_keeps_it_near_the_demonstrations(
     distances = {}
     for scale in (0.5, 0.0):
         log = tmp_path / f"{scale}.jsonl"
-        run_well(
-            "lerobot-rollout",
-            f"--policy.path={checkpoint}",
-            f"--policy.guidance_scale={scale}",
-            "--device=cpu",
-            *ROBOT,
-            f"--robot.log={log}",
-            "--fps=10",
-            "--duration=4",
-            "--play_sounds=false",
-            "--return_to_initial_position=false",
-        )
+        roll_out(checkpoint, log, f"--policy.guidance_scale={scale}", n_actions=32)
         distances[scale] = distance_from_demonstrations(log, postures)
     assert distances[0.5] < 0.2 * distances[0.0]
 
@@ -97,19 +114,7 @@ def test_a_rollout_with_real_time_chunking_moves_the_arm_near_the_demonstrations
 ) -> None:
     checkpoint, postures = demonstrated
     log = tmp_path / "chunks.jsonl"
-    run_well(
-        "lerobot-rollout",
-        f"--policy.path={checkpoint}",
-        "--device=cpu",
-        "--inference.type=rtc",
-        "--inference.rtc.execution_horizon=6",
-        *ROBOT,
-        f"--robot.log={log}",
-        "--fps=10",
-        "--duration=5",
-        "--play_sounds=false",
-        "--return_to_initial_position=false",
-    )
+    roll_out(checkpoint, log, "--inference.type=rtc", "--inference.rtc.execution_horizon=6", n_actions=40)
     # Between two chunks, and on a busy machine, the arm is further from the demonstrations than at their postures.
     assert distance_from_demonstrations(log, postures) < 0.2
 
@@ -120,20 +125,9 @@ def test_a_compiled_policy_moves_the_arm_near_the_demonstrations(
 ) -> None:
     checkpoint, postures = demonstrated
     log = tmp_path / "compiled.jsonl"
-    run_well(
-        "lerobot-rollout",
-        f"--policy.path={checkpoint}",
-        "--device=cpu",
-        f"--inference.type={inference}",
-        "--use_torch_compile=true",
-        "--torch_compile_backend=eager",  # what can go wrong is the capturing, not inductor, which takes a minute more
-        *ROBOT,
-        f"--robot.log={log}",
-        "--fps=10",
-        "--duration=20",
-        "--play_sounds=false",
-        "--return_to_initial_position=false",
-    )
+    # What can go wrong is the capturing, not inductor, which takes a minute more.
+    options = [f"--inference.type={inference}", "--use_torch_compile=true", "--torch_compile_backend=eager"]
+    roll_out(checkpoint, log, *options, n_actions=40)
     assert distance_from_demonstrations(log, postures) < 0.2
 
 
@@ -160,18 +154,24 @@ def policy_server(folder: Path) -> Iterator[str]:
 
 CLIENT = """
 import sys, threading, time
+from pathlib import Path
 import simulated_panda
 from lerobot.async_inference.configs import RobotClientConfig
 from lerobot.async_inference.robot_client import RobotClient
 
-address, checkpoint, log = sys.argv[1:]
+address, checkpoint, log = sys.argv[1], sys.argv[2], Path(sys.argv[3])
 client = RobotClient(RobotClientConfig(
     policy_type="pf2mp", pretrained_name_or_path=checkpoint, actions_per_chunk=8, server_address=address, fps=10,
-    robot=simulated_panda.SimulatedPandaConfig(log=log)))
+    robot=simulated_panda.SimulatedPandaConfig(log=str(log))))
 assert client.start()
 receiver = threading.Thread(target=client.receive_actions, daemon=True)
 receiver.start()
-threading.Timer(12.0, client.shutdown_event.set).start()
+def stop_after_five_chunks():
+    while not (log.exists() and log.read_text().count("\\n") >= 40):
+        time.sleep(0.1)
+    client.shutdown_event.set()
+
+threading.Thread(target=stop_after_five_chunks, daemon=True).start()
 client.control_loop(task="")
 client.stop()
 """
