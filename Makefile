@@ -6,10 +6,10 @@ demo: .venv/installed
 
 # Two processes, each of which takes whole files.
 test: .venv/installed
-	.venv/bin/pytest --numprocesses=2 --dist=loadfile --durations=20
+	.venv/bin/pytest --numprocesses=2 --dist=loadfile --no-loadscope-reorder --durations=20
 
 test-fast: .venv/installed
-	.venv/bin/pytest --numprocesses=2 --dist=loadfile --durations=20 -m "not slow"
+	.venv/bin/pytest --numprocesses=2 --dist=loadfile --no-loadscope-reorder --durations=20 -m "not slow"
 
 check: .venv/installed
 	.venv/bin/ruff check .

@@ -19,6 +19,12 @@ def pytest_report_header() -> str:
     return f"lerobot_pf2mp: {Path(lerobot_pf2mp.__file__).parent}"
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Puts the files with slow tests first, so that of two processes none has much left when the other has ended."""
+    files = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in files)
+
+
 @pytest.fixture(autouse=True)
 def _seed() -> None:
     torch.manual_seed(0)

@@ -422,6 +422,7 @@ def test_every_kind_of_guidance_is_the_one_that_acts(
     ]
 
 
+@pytest.mark.slow
 def test_collisions_and_successes_are_counted(
     checkpoints: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -73,6 +73,7 @@ def noises(n: int) -> list[Tensor]:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "options"),
     [
@@ -99,6 +100,7 @@ def test_a_compiled_policy_plans_the_same_and_is_compiled_once(kind: str, option
     assert not torch.equal(found[0], found[1])
 
 
+@pytest.mark.slow
 def test_the_steps_of_a_guided_policy_are_one_graph(sums: str) -> None:
     policy = policy_of("pf2mp")
     (batch,), (noise,) = batches_for(policy, 1), noises(1)
@@ -108,6 +110,7 @@ def test_the_steps_of_a_guided_policy_are_one_graph(sums: str) -> None:
     torch.testing.assert_close(chunk, policy.predict_action_chunk(batch, noise=noise), rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_compiled_policy_watches_its_plans() -> None:
     policy = policy_of("pf2mp", on_unsupported="hold", guidance_scale=0.0)
     (batch,), (noise,) = batches_for(policy, 1), noises(1)

@@ -308,6 +308,7 @@ def test_single_episodes_can_be_loaded(pair) -> None:
     )
 
 
+@pytest.mark.slow
 def test_files_and_folders_begin_where_lerobot_begins_them(tmp_path: Path, monkeypatch) -> None:
     # A new file after every few episodes, a new folder after two files.
     monkeypatch.setattr(LeRobotDatasetMetadata, "data_files_size_in_mb", property(lambda self: 0.05))
@@ -341,6 +342,7 @@ def test_metadata_say_in_which_file_they_and_the_frames_are(tmp_path: Path, monk
             assert (frames["episode_index"] == row["episode_index"]).sum() == row["length"]
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_number_of_episodes(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(lerobot_writer, "_BATCH_FRAMES", 300)
 

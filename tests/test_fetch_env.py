@@ -633,6 +633,7 @@ def clearances(reach: FetchEnv) -> Measured:
     return Measured(np.array(reported), np.array(exact))
 
 
+@pytest.mark.slow
 def test_the_clearance_is_the_exact_distance_between_wall_and_robot(clearances: Measured) -> None:
     np.testing.assert_allclose(clearances.reported, clearances.exact, atol=0.002)
 

@@ -66,6 +66,7 @@ def length_of(path: Path2D) -> float:
     return float(np.linalg.norm(np.diff(path.positions, axis=0), axis=1).sum())
 
 
+@pytest.mark.slow
 def test_the_paths_are_those_that_the_benchmark_counts(checkpoint: str, tmp_path: Path) -> None:
     figures = figures_of(checkpoint, guidance_scale=0.8)
     pairs = figures.path_pairs(1, EPISODES)
@@ -183,6 +184,7 @@ def test_every_figure_is_drawn_of_what_it_is_called(
         assert given["guided"].shape[1] == len(given["starts"]) == len(given["goals"]) == 2
 
 
+@pytest.mark.slow
 def test_a_film_shows_every_step_of_the_episode_and_the_same_one_twice(checkpoint: str) -> None:
     figures = figures_of(checkpoint)
     pair = figures.path_pairs(1, [1])[0]

@@ -1210,6 +1210,7 @@ def test_pictures_from_the_top_leave_out_the_arm_and_from_the_side_show_it(
         assert is_red(pictures[0]).mean() > 0.002
 
 
+@pytest.mark.slow
 def test_two_environments_rendered_in_turns_do_not_disturb_each_other() -> None:
     envs = [
         HandwritingEnv(

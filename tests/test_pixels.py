@@ -54,6 +54,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return roots
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ENVS)
 def test_an_environment_shows_what_it_renders_instead_of_its_state(name: str) -> None:
     config = ENVS[name](obs_type="pixels_agent_pos", render_size=WIDTH)

@@ -312,6 +312,7 @@ def test_a_figure_that_cannot_be_written_leaves_nothing(
     assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("old.png", b"old")]
 
 
+@pytest.mark.slow
 def test_the_flow_moves_from_noise_to_paths(tmp_path: Path) -> None:
     scene = scene_of((0.0, 0.0), (0.3, 0.1), maze_map=MAZE_MAP)
     noise, ends = torch.randn(1, 2, 5, 2), torch.zeros(1, 2, 5, 2)

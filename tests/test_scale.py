@@ -219,7 +219,7 @@ def _gather_in_a_process(rank: int, n_processes: int, folder: Path) -> None:
 
 @pytest.mark.slow
 def test_every_process_gets_the_rows_of_all_however_many_each_has(tmp_path: Path) -> None:
-    context = multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
     processes = [context.Process(target=_gather_in_a_process, args=(rank, 3, tmp_path)) for rank in range(3)]
     for process in processes:
         process.start()

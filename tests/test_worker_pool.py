@@ -26,6 +26,7 @@ def leave_a_mark(folder: str, number: int) -> None:
     (Path(folder) / str(number)).touch()
 
 
+@pytest.mark.slow
 def test_tasks_run_in_other_processes_after_the_initializer() -> None:
     with worker_pool(2, set_offset, (10,)) as pool:
         results = list(pool.map(add, range(4)))
@@ -34,6 +35,7 @@ def test_tasks_run_in_other_processes_after_the_initializer() -> None:
     assert _offset == 0
 
 
+@pytest.mark.slow
 def test_what_has_not_begun_when_an_error_comes_is_dropped(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="enough"), worker_pool(1, set_offset, (0,)) as pool:
         for number in range(50):
@@ -44,6 +46,7 @@ def test_what_has_not_begun_when_an_error_comes_is_dropped(tmp_path: Path) -> No
     assert 1 <= len(list(tmp_path.iterdir())) < 10
 
 
+@pytest.mark.slow
 def test_what_has_begun_is_dropped_too_when_an_interruption_comes(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt), worker_pool(1, set_offset, (0,)) as pool:
         pool.submit(leave_a_mark, str(tmp_path), 0)
