@@ -276,6 +276,7 @@ def test_a_benchmark_leaves_rows_summary_tables_and_what_it_was_made_with(
     }
 
 
+@pytest.mark.slow
 def test_a_guided_policy_has_another_name_without_guidance_and_others_are_evaluated_once(
     checkpoints: dict[str, str], tmp_path: Path
 ) -> None:
@@ -331,6 +332,7 @@ def test_names_may_hold_commas_and_quotes(checkpoints: dict[str, str], tmp_path:
     assert run(spec, tmp_path) == rows
 
 
+@pytest.mark.slow
 def test_task_and_seed_in_a_path_stand_for_the_task_and_the_training_seed(
     checkpoints: dict[str, str], tmp_path: Path
 ) -> None:
@@ -347,6 +349,7 @@ def test_task_and_seed_in_a_path_stand_for_the_task_and_the_training_seed(
     assert len({row.path_length_m for row in rows}) == len(rows)
 
 
+@pytest.mark.slow
 def test_variants_change_the_configuration_of_the_policy(
     checkpoints: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -455,6 +458,7 @@ def test_collisions_and_successes_are_counted(
     assert all(row.path_length_m == pytest.approx(0, abs=1e-5) for row in still)
 
 
+@pytest.mark.slow
 def test_the_latency_is_that_of_planning_a_chunk_for_one_robot(
     checkpoints: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -473,6 +477,7 @@ def test_the_latency_is_that_of_planning_a_chunk_for_one_robot(
 # The same for all
 
 
+@pytest.mark.slow
 def test_all_policies_get_the_same_pairs_and_in_every_repeat_the_same_noise_and_other_repeats_other_noise(
     checkpoints: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -515,6 +520,7 @@ def test_all_policies_get_the_same_pairs_and_in_every_repeat_the_same_noise_and_
     assert len(every_chunk.unique(dim=0)) == len(every_chunk) == 2 * n_chunks * 2
 
 
+@pytest.mark.slow
 def test_repeats_differ_in_the_noise_alone_and_without_guidance_a_policy_is_its_unguided_kind(
     checkpoints: dict[str, str], tmp_path: Path
 ) -> None:
@@ -533,6 +539,7 @@ def test_repeats_differ_in_the_noise_alone_and_without_guidance_a_policy_is_its_
             assert (left != right) == draws_noise
 
 
+@pytest.mark.slow
 def test_results_do_not_depend_on_what_ran_before(
     checkpoints: dict[str, str], whole: Path, whole_spec: BenchmarkSpec, tmp_path: Path
 ) -> None:
@@ -542,6 +549,7 @@ def test_results_do_not_depend_on_what_ran_before(
     assert sorted(rows, key=repr) == sorted(timeless(rows_of(whole)), key=repr)
 
 
+@pytest.mark.slow
 def test_the_same_command_gives_the_same_file_but_for_latency_and_commit(
     whole: Path, whole_spec: BenchmarkSpec, tmp_path: Path
 ) -> None:
@@ -615,6 +623,7 @@ def test_a_benchmark_that_was_cut_short_goes_on_where_it_was(
     assert_goes_on(copied, whole_spec, whole, evaluations, n_kept)
 
 
+@pytest.mark.slow
 def test_an_interruption_leaves_the_repeats_that_are_done(
     whole: Path,
     whole_spec: BenchmarkSpec,
@@ -641,6 +650,7 @@ def test_an_interruption_leaves_the_repeats_that_are_done(
     assert (tmp_path / "episodes.csv").read_text().startswith((tmp_path / "before.csv").read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "begin",
     [

@@ -134,6 +134,7 @@ def test_compiled_sums_are_the_same(is_prepared: bool, sums: str) -> None:
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_compiled_field_is_the_same(sums: str) -> None:
     points = paths(1000, 2)
     field = fit(points, threshold_quantile=0.2, alpha=-1.0).prepared

@@ -230,6 +230,7 @@ def test_every_sample_equals_that_of_a_dataset_written_by_lerobot(pair) -> None:
                 assert left[key] == right[key], key
 
 
+@pytest.mark.slow
 def test_chunks_of_actions_equal_those_of_a_dataset_written_by_lerobot(pair) -> None:
     deltas = {"action": [i / SPEC.fps for i in range(4)]}
     ours, theirs = (
@@ -329,6 +330,7 @@ def test_files_and_folders_begin_where_lerobot_begins_them(tmp_path: Path, monke
     assert ours.hf_dataset.with_format("arrow")[:].equals(theirs.hf_dataset.with_format("arrow")[:])
 
 
+@pytest.mark.slow
 def test_metadata_say_in_which_file_they_and_the_frames_are(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(LeRobotDatasetMetadata, "data_files_size_in_mb", property(lambda self: 0.05))
     monkeypatch.setattr(lerobot_writer, "_BATCH_FRAMES", 100)
@@ -362,6 +364,7 @@ def test_memory_does_not_grow_with_the_number_of_episodes(tmp_path: Path, monkey
 # The writer, when something goes wrong
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -395,6 +398,7 @@ def test_a_dataset_without_episodes_is_refused_and_leaves_nothing_behind(tmp_pat
     assert everything_in(tmp_path) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n_before", [0, 1, 3, 120])
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
 def test_an_interruption_leaves_nothing_behind(
@@ -411,6 +415,7 @@ def test_an_interruption_leaves_nothing_behind(
     assert everything_in(tmp_path) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
 def test_an_interruption_keeps_the_dataset_that_was_to_be_replaced(
     tmp_path: Path, error: type[BaseException]
@@ -428,6 +433,7 @@ def test_an_interruption_keeps_the_dataset_that_was_to_be_replaced(
     assert contents_of(tmp_path) == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n_before", [0, 2, 5])  # 5 episodes, then their metadata
 def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, monkeypatch, n_before: int) -> None:
     write_table, n_calls = pq.ParquetWriter.write_table, itertools.count()
@@ -457,6 +463,7 @@ def test_a_disk_too_full_for_metadata_leaves_nothing_behind(tmp_path: Path, monk
     assert everything_in(tmp_path) == []
 
 
+@pytest.mark.slow
 def test_a_dataset_survives_when_its_replacement_cannot_take_its_place(tmp_path: Path, monkeypatch) -> None:
     write_dataset(tmp_path / "d", SPEC, toy_episodes(2))
     before = contents_of(tmp_path)
@@ -494,6 +501,7 @@ def test_a_dataset_is_not_replaced_unless_asked_for(tmp_path: Path) -> None:
     assert contents_of(tmp_path) == before
 
 
+@pytest.mark.slow
 def test_a_dataset_is_replaced_when_asked_for(tmp_path: Path) -> None:
     for n_episodes in (2, 3):
         write_dataset(tmp_path / "d", SPEC, toy_episodes(n_episodes), overwrite=True)
@@ -502,6 +510,7 @@ def test_a_dataset_is_replaced_when_asked_for(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["d"]
 
 
+@pytest.mark.slow
 def test_a_folder_that_is_no_dataset_is_never_replaced(tmp_path: Path) -> None:
     (tmp_path / "home").mkdir()
     (tmp_path / "home" / "thesis.tex").write_text("years of work")
@@ -543,6 +552,7 @@ def test_a_collected_dataset_reads_back_as_the_expert_drove(tmp_path: Path) -> N
         assert samples[0]["task"] == "Move the ball to the red goal without touching a wall."
 
 
+@pytest.mark.slow
 def test_a_collected_dataset_is_the_same_bytes_for_the_same_seed(tmp_path: Path) -> None:
     for name, seed in (("first", 0), ("again", 0), ("other", 1)):
         collect_maze(
@@ -607,6 +617,7 @@ def test_no_more_episodes_are_written_than_asked_for(tmp_path: Path) -> None:
     assert LeRobotDataset("a/b", root=tmp_path / "d").num_episodes == 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [

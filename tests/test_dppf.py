@@ -430,6 +430,7 @@ def test_a_field_over_other_dimensions_is_an_error(dim):
 # What the field learns from.
 
 
+@pytest.mark.slow
 def test_the_field_holds_every_action_that_training_saw_once_whatever_is_observed():
     episode = torch.randn(30, ACTION_DIM)
     field = DemonstratedActions(DPPFConfig(**SMALL).field_settings)

@@ -198,6 +198,7 @@ def test_the_environment_is_passed_on_as_it_is() -> None:
         _ = recorder.nothing_of_this_name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("control", ["exact", "pd"])
 def test_the_numbers_of_a_maze_are_those_of_a_rollout_of_one_environment(control: str) -> None:
     n_envs, n_steps, seed = 3, 15, 20

@@ -203,6 +203,7 @@ def test_the_block_of_the_scenes_is_that_of_the_model(push: FetchEnv) -> None:
 # Gymnasium
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", FETCH_TASKS)
 def test_gymnasium_finds_nothing_to_complain_about(task: str) -> None:
     env = gym.make(f"lerobot_pf2mp/{task}", render_mode="rgb_array", render_size=64)
@@ -253,6 +254,7 @@ def assert_same(first: list[tuple], second: list[tuple]) -> None:
             np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
 def test_the_same_seed_gives_the_same_rollout_and_another_seed_another(env: FetchEnv, task: str) -> None:
     # A new environment, one that has been used, and one that takes pictures on the way.
@@ -468,6 +470,7 @@ def test_two_inner_steps_are_two_steps_with_the_same_target(reach: FetchEnv) -> 
 # Collisions and rewards
 
 
+@pytest.mark.slow
 def test_a_gripper_driven_straight_at_the_goal_hits_the_wall(reach: FetchEnv) -> None:
     _, info = reach.reset(seed=0, options=FREE)
     assert info["clearance"] == pytest.approx(0.067, abs=0.003)  # to the hand's side
@@ -588,6 +591,7 @@ def test_a_touch_in_the_middle_of_the_inner_steps_is_a_collision(patient: FetchE
     assert reward == -1.0
 
 
+@pytest.mark.slow
 def test_a_touch_in_the_last_physics_step_is_a_collision(reach: FetchEnv) -> None:
     n_touches = 0
     for y in (0.6075, 0.6195, 0.6315):
@@ -950,6 +954,7 @@ def test_an_error_while_rendering_names_the_packages_and_its_cause(no_screen: py
     assert isinstance(caught.value.__cause__, KeyError)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # Gymnasium's half-made viewer
 def test_a_backend_that_does_not_exist_is_one_clear_error(no_screen: pytest.MonkeyPatch) -> None:
     no_screen.setenv("MUJOCO_GL", "nonsense")
@@ -968,6 +973,7 @@ def vector_env(config: PF2MPFetchEnv, n_envs: int) -> gym.vector.VectorEnv:
     return make_env(config, n_envs=n_envs)["pf2mp_fetch"][0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("task", "n_coordinates"), [("FetchReachWall-v0", 3), ("FetchPushWall-v0", 6)])
 def test_lerobot_makes_vectorised_environments_of_the_configuration(task: str, n_coordinates: int) -> None:
     config = make_env_config("pf2mp_fetch", task=task, episode_length=5, render_size=64)

@@ -80,6 +80,7 @@ def test_only_push_has_a_block_and_its_wall_is_lower() -> None:
     assert reach.sample(np.random.default_rng(0)).block is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("task", "share"), [("reach", 0.86), ("push", 0.91)])
 def test_most_straight_ways_are_blocked(task: str, share: float) -> None:
     scene = FETCH_SCENES[task]

@@ -108,6 +108,7 @@ def shortest_above(start: np.ndarray, goal: np.ndarray, boxes: Sequence[Box]) ->
     return float(shortest_path(distances, directed=False, indices=0)[1])
 
 
+@pytest.mark.slow
 def test_routes_lead_from_start_to_goal_through_no_box_the_shortest_first() -> None:
     n_routes = Counter()
     for start, goal, boxes in cases(400):
@@ -128,6 +129,7 @@ def test_there_are_no_routes_when_an_end_is_in_a_box_and_otherwise_there_is_one(
         assert bool(routes(start, goal, boxes)) != is_inside(np.array([start, goal]), boxes)
 
 
+@pytest.mark.slow
 def test_a_route_is_straight_when_nothing_is_in_the_way() -> None:
     n_free = 0
     for start, goal, boxes in cases(400):
@@ -140,6 +142,7 @@ def test_a_route_is_straight_when_nothing_is_in_the_way() -> None:
     assert n_free > 100
 
 
+@pytest.mark.slow
 def test_no_route_is_longer_than_the_shortest_one_above() -> None:
     n_blocked = 0
     for start, goal, boxes in cases(200):
@@ -152,6 +155,7 @@ def test_no_route_is_longer_than_the_shortest_one_above() -> None:
     assert n_blocked > 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("margin", [0.0, 0.02, 0.05])
 @pytest.mark.parametrize("task", TASKS)
 def test_routes_past_the_walls_of_the_tasks_are_at_most_twice_the_straight_way(
@@ -451,6 +455,7 @@ def test_demonstrations_that_are_no_good_are_left_out_and_counted(
     assert LeRobotDataset("local/fetch", root=tmp_path / "d").num_episodes == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
 def test_an_interruption_of_collecting_leaves_nothing_behind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[BaseException]
@@ -723,6 +728,7 @@ def test_only_positions_are_read_from_observations(tmp_path: Path) -> None:
     assert_holds(tmp_path / "d", [PUSHED])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("task", "recordings"), [("reach", [BESIDE, THROUGH, ABOVE]), ("push", [PUSHED] * 2)]
 )

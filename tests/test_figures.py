@@ -85,6 +85,7 @@ def test_the_paths_are_those_that_the_benchmark_counts(checkpoint: str, tmp_path
         np.testing.assert_array_equal(pair.guided.positions, same.guided.positions)
 
 
+@pytest.mark.slow
 def test_named_episodes_are_drawn_in_their_order(checkpoint: str) -> None:
     pairs = figures_of(checkpoint).path_pairs(1, [2, 0])
     assert [pair.episode for pair in pairs] == [2, 0]
@@ -117,6 +118,7 @@ def test_without_names_the_episodes_that_show_the_difference_are_drawn(
     assert [pair.episode for pair in figures.path_pairs(3)] == [2, 1, 0]
 
 
+@pytest.mark.slow
 def test_the_flow_ends_with_the_chunks_that_the_policy_predicts(checkpoint: str) -> None:
     unguided, guided, starts, goals = figures_of(checkpoint).trace_flow(3)
     assert unguided.shape == guided.shape == (2 + 1, 3, 8, 2)
@@ -160,6 +162,7 @@ def test_a_policy_without_guidance_is_refused(tmp_path: Path, kind: str) -> None
         figures_of(write_checkpoint(tmp_path / kind, kind))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("figure", ["density", "arrows", "trajectories", "overview", "flow"])
 def test_every_figure_is_drawn_of_what_it_is_called(
     checkpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, figure: str
@@ -213,6 +216,7 @@ def test_fetch_is_drawn_with_its_wall_and_its_block_is_no_part_of_the_way(tmp_pa
     assert sorted(path.name for path in tmp_path.iterdir()) == ["policy", "trajectories.png", "video.mp4"]
 
 
+@pytest.mark.slow
 def test_environments_are_closed(checkpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[gym.vector.VectorEnv] = []
     create_envs = PF2MPMazeEnv.create_envs

@@ -280,6 +280,7 @@ def test_diffusion_policies_become_dppf_and_flow_matching_policies_pf2mp():
     assert GUIDED_TYPES == {"diffusion": "dppf", "dppf": "dppf", "fmp": "pf2mp", "pf2mp": "pf2mp"}
 
 
+@pytest.mark.slow
 @every_checkpoint
 def test_the_new_checkpoint_is_of_the_guided_type_and_holds_one_field(name, checkpoint, shown, tmp_path):
     old, new = checkpoint(name), tmp_path / "new"
@@ -298,6 +299,7 @@ def test_the_new_checkpoint_is_of_the_guided_type_and_holds_one_field(name, chec
     assert [path.name for path in tmp_path.iterdir()] == ["new"]
 
 
+@pytest.mark.slow
 @every_checkpoint
 def test_the_weights_are_bit_for_bit_those_of_the_old_checkpoint(name, checkpoint, fitted):
     weights = load_file(fitted(name) / "model.safetensors")
@@ -307,6 +309,7 @@ def test_the_weights_are_bit_for_bit_those_of_the_old_checkpoint(name, checkpoin
         assert any(not torch.equal(average[k], weights[k.replace("ema.module", "network")]) for k in average)
 
 
+@pytest.mark.slow
 @every_checkpoint
 def test_only_guidance_changes_what_the_policy_does(name, checkpoint, fitted):
     off = {"guidance_scale": 0} if "guidance_scale" in config_of(checkpoint(name)) else {}
@@ -381,6 +384,7 @@ def test_options_that_are_given_take_effect_and_the_others_stay(name, checkpoint
 # The field.
 
 
+@pytest.mark.slow
 @every_checkpoint
 def test_the_anchors_are_the_datasets_actions_in_the_normalisation_of_the_checkpoint(
     name, checkpoint, shown, tmp_path
@@ -395,6 +399,7 @@ def test_the_anchors_are_the_datasets_actions_in_the_normalisation_of_the_checkp
     assert (of_the_dataset(points) - of_the_checkpoint(points)).abs().max() > 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["diffusion_of_two_frames", "fmp", "pf2mp"])
 def test_the_field_is_bit_for_bit_the_one_that_training_on_all_frames_leaves(
     name, checkpoint, folder, shown, tmp_path
@@ -412,6 +417,7 @@ def test_the_field_is_bit_for_bit_the_one_that_training_on_all_frames_leaves(
     assert_same_tensors(fitted, trained)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["dppf", "pf2mp"])
 def test_the_new_field_replaces_the_old_one(name, checkpoint, folder, shown, tmp_path):
     # The old field is fitted to frames that the new one does not see.
@@ -444,6 +450,7 @@ def test_a_dataset_that_is_read_in_blocks_gives_the_same_field(
     assert contents_of(fit(checkpoint("fmp"), tmp_path / "new", shown)) == expected
 
 
+@pytest.mark.slow
 def test_images_of_the_dataset_are_not_decoded(checkpoint, tmp_path, monkeypatch):
     front = "observation.images.front"
     features = {**FEATURES, front: {"dtype": "image", "shape": (8, 8, 3), "names": None}}
@@ -468,6 +475,7 @@ def test_images_of_the_dataset_are_not_decoded(checkpoint, tmp_path, monkeypatch
 # What comes after.
 
 
+@pytest.mark.slow
 def test_later_training_starts_the_field_afresh(folder, fitted, shown, tmp_path):
     # On other data, on the data of the field, and on those of the policy: nothing fitted may remain.
     for data in (folder / "learned", shown):
@@ -567,6 +575,7 @@ def test_actions_that_are_not_finite_are_refused(checkpoint, tmp_path):
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.slow
 def test_an_existing_checkpoint_is_replaced_only_if_asked_to(checkpoint, fitted, shown, tmp_path):
     new = fit(checkpoint("fmp"), tmp_path / "new", shown, options={"n_field_points": 5})
     (new / "policy_preprocessor_step_9_old.safetensors").write_text("left over")
@@ -632,6 +641,7 @@ def test_a_failure_in_the_middle_leaves_everything_as_it_was(
     assert [path.name for path in tmp_path.iterdir()] == (["new"] if exists else [])
 
 
+@pytest.mark.slow
 def test_a_failure_leaves_no_empty_folders(checkpoint, tmp_path):
     data = write(tmp_path / "data", seed=0, scale=1.0, features={key: FEATURES[key] for key in (STATE, ENV)})
     with pytest.raises(ValueError, match="the dataset's action must have"):
@@ -663,6 +673,7 @@ def test_the_command_says_what_it_wrote(checkpoint, fitted, shown, tmp_path, com
     assert contents_of(tmp_path / "new") == contents_of(fitted("diffusion"))
 
 
+@pytest.mark.slow
 def test_the_command_passes_every_option_on(checkpoint, shown, tmp_path, command):
     command(
         *arguments(checkpoint("pf2mp"), shown, tmp_path / "new"),

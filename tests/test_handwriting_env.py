@@ -453,6 +453,7 @@ def test_scribbling_over_the_sheet_is_no_success() -> None:
 # Gymnasium
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("control", "render_mode"), [("exact", None), ("physics", None), ("physics", "rgb_array")]
 )
@@ -520,6 +521,7 @@ def assert_same(first: list[tuple], second: list[tuple]) -> None:
             np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("control", CONTROLS)
 @pytest.mark.parametrize("space", SPACES)
 def test_the_same_seed_gives_the_same_rollout_and_another_seed_another(
@@ -663,6 +665,7 @@ def test_exact_joints_reach_every_action(exact: HandwritingEnv) -> None:
         np.testing.assert_array_equal(observation["agent_pos"], action)
 
 
+@pytest.mark.slow
 def test_an_exact_pen_reaches_every_place_on_the_sheet_from_every_other(envs: dict) -> None:
     env = envs["pen", "exact", "S"]
     corners = [np.array(corner) for corner in itertools.product(*zip(LOW, HIGH, strict=True))]
@@ -1151,6 +1154,7 @@ def top_camera() -> Iterator[HandwritingEnv]:
     env.close()
 
 
+@pytest.mark.slow
 def test_pictures_show_the_ink_where_it_is_drawn(top_camera: HandwritingEnv) -> None:
     stroke = points_along(top_camera.scene.stroke, 41)
     top_camera.reset(seed=0, options={"start": stroke[0]})
@@ -1196,6 +1200,7 @@ def test_pictures_show_letter_and_regions_where_they_are(bar_file: str, tmp_path
     env.close()
 
 
+@pytest.mark.slow
 def test_pictures_from_the_top_leave_out_the_arm_and_from_the_side_show_it(
     arm_camera: HandwritingEnv, top_camera: HandwritingEnv
 ) -> None:
@@ -1232,6 +1237,7 @@ def test_two_environments_rendered_in_turns_do_not_disturb_each_other() -> None:
         env.close()
 
 
+@pytest.mark.slow
 def test_a_sheet_full_of_strokes_can_be_rendered(top_camera: HandwritingEnv) -> None:
     rng = np.random.default_rng(0)
     top_camera.reset(seed=0)
@@ -1241,6 +1247,7 @@ def test_a_sheet_full_of_strokes_can_be_rendered(top_camera: HandwritingEnv) -> 
     assert is_blue(top_camera.render()).mean() > 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "shape"), [(32, (24, 32, 3)), (127, (96, 126, 3)), (800, (600, 800, 3))])
 def test_pictures_have_even_sides(size: int, shape: tuple[int, int, int]) -> None:
     env = HandwritingEnv("pen", control="exact", render_mode="rgb_array", render_size=size, camera="top")
@@ -1265,6 +1272,7 @@ def vector_env(config: PF2MPHandwritingEnv, n_envs: int) -> gym.vector.VectorEnv
     return make_env(config, n_envs=n_envs)["pf2mp_handwriting"][0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("task", "n"), [("HandwritingJoint-v0", 9), ("HandwritingPen-v0", 2)])
 def test_lerobot_makes_vectorised_environments_of_the_configuration(task: str, n: int) -> None:
     config = make_env_config("pf2mp_handwriting", task=task, episode_length=4, fps=20, render_size=64)

@@ -178,6 +178,7 @@ def straight_and_arcs() -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     return np.concatenate(parts), np.array(bends), middles
 
 
+@pytest.mark.slow
 def test_the_pen_slows_down_in_curves_with_the_third_power_of_their_radius() -> None:
     stroke, bends, middles = straight_and_arcs()
     tree = KDTree(stroke)
@@ -262,6 +263,7 @@ def test_a_way_from_which_the_arm_strays_into_a_region_is_in_collision(tmp_path:
     assert ScriptedScribe(other, n_steps, seed=0).demonstrate(0) == "in collision"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("space", SPACES)
 def test_no_demonstration_leaves_the_sheet(space: str) -> None:
     env = HandwritingEnv(space, "O", letter_height=0.31, n_regions=0)
@@ -453,6 +455,7 @@ def test_a_scene_that_leaves_hardly_any_room_ends_in_an_error_and_nothing_writte
     assert everything_in(tmp_path) == ["straight.json"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
 def test_an_interruption_of_collecting_leaves_nothing_behind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[BaseException]
@@ -936,6 +939,7 @@ def test_joint_offsets_are_refused_for_a_recording_without_joints(tmp_path: Path
         read_handwriting(path, [0.0, 0.0, 0.0, 0.0, 0.0, -1.5708, -0.7854])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("values", "changes", "message"),
     [

@@ -559,6 +559,7 @@ def results_folder(path: Path, *without: str) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_bad_arguments_of_push_end_in_one_line(checkpoint, tmp_path, refused):
     path, here = f"--path={checkpoint('fmp')}", "--repo_id=user/repo"
     assert "--path must be given" in refused("push", here)

@@ -74,6 +74,7 @@ def assert_same(actual: dict[str, Any], expected: dict[str, Any]) -> None:
             assert actual[key] == value, key
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("episodes", EPISODES, ids=str)
 @pytest.mark.parametrize("windows", WINDOWS)
 def test_every_sample_equals_that_of_lerobots_dataset(root, windows, episodes):
@@ -169,6 +170,7 @@ def test_samples_may_be_modified_without_harm(root):
     assert_same({key: value for key, value in in_memory[3].items() if key != "task"}, before)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("episodes", [None, [0, 2]], ids=str)
 def test_a_data_loader_gives_the_same_batches_in_the_same_order(root, episodes):
     epochs = []

@@ -43,6 +43,7 @@ def test_sums_at_demonstrated_places_are_those_of_brute_force(way, dim: int, h: 
     check(way, queries, anchors, h)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["attention", "the fastest"])
 def test_many_anchors_around_a_query_cost_no_digits(way: str) -> None:
     # So wide a spread, in bandwidths, that float32 alone would be wrong by more than 1e-4.

@@ -121,6 +121,7 @@ def test_the_clearance_of_a_step_is_the_exact_distance_to_the_walls(
     assert_agrees_with_the_distance(swept_ball(maze_map, radius), radius, maze_map, pairs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radius", [0.1, 0.0])
 def test_the_clearance_of_a_jump_over_whole_walls_is_negative(radius: float) -> None:
     # Both ends are free, and a whole block lies between them.
@@ -641,6 +642,7 @@ def vector_env(config: PF2MPMazeEnv, n_envs: int, use_async_envs: bool = False) 
     return make_env(config, n_envs=n_envs, use_async_envs=use_async_envs)["pf2mp_maze"][0]
 
 
+@pytest.mark.slow
 def test_lerobot_makes_vectorised_environments_of_the_configuration() -> None:
     config = make_env_config("pf2mp_maze", task="MazeMedium-v0", episode_length=7, fps=20, render_size=64)
     env = vector_env(config, n_envs=3)

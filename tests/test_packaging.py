@@ -75,6 +75,7 @@ def test_constraints_name_every_package_that_is_asked_for() -> None:
     assert asked_for - constrained == {canonicalize_name(project["name"])}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", sorted((ROOT / "eval_configs").rglob("*.yaml")), ids=lambda path: path.stem)
 def test_configuration_files_are_valid(path: Path) -> None:
     content = yaml.safe_load(path.read_text())

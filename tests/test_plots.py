@@ -279,6 +279,7 @@ def test_the_overview_says_which_way_collides(tmp_path: Path, drawn: list[Figure
 # Files
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("background", list(THEMES))
 def test_every_figure_has_the_colour_of_its_background(tmp_path: Path, background: str) -> None:
     scene = scene_of((0.0, 0.0), (0.3, 0.1), maze_map=MAZE_MAP)

@@ -151,6 +151,7 @@ def test_a_sample_of_nothing_but_padding_has_no_loss():
     assert loss_of(policy, batch) == 0
 
 
+@pytest.mark.slow
 def test_training_lowers_the_loss():
     policy = fmp().train()
     batch = training_batch(policy, 16)
@@ -181,6 +182,7 @@ def test_the_optimiser_takes_the_steps_of_lerobots_adamw():
     assert FMPConfig(device="cpu").get_optimizer_preset().build([weights]).param_groups[0]["fused"]
 
 
+@pytest.mark.slow
 def test_gradient_checkpointing_changes_neither_loss_nor_gradient():
     results = []
     for checkpointing in (False, True):
@@ -243,6 +245,7 @@ def test_every_observed_frame_of_every_state_matters(inputs, n_obs_steps):
             assert changed.any(dim=-1).any(dim=-1).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("inputs", "options"),
     [
@@ -273,6 +276,7 @@ def test_every_observed_frame_of_every_camera_matters(inputs, options):
             assert not torch.equal(policy.predict_action_chunk(other, noise=noise), chunk)
 
 
+@pytest.mark.slow
 def test_cameras_are_told_apart_with_shared_and_with_separate_encoders():
     for separate in (False, True):
         policy = fmp(FRONT, WRIST, use_ema=False, use_separate_rgb_encoder_per_camera=separate).eval()
@@ -652,6 +656,7 @@ def test_the_average_follows_its_closed_form(decay):
     assert differs == (decay > 0)
 
 
+@pytest.mark.slow
 def test_the_average_goes_on_exactly_after_saving_and_loading(tmp_path):
     policy = fmp()
     train_a_little(policy)

@@ -171,6 +171,7 @@ def test_touching_the_wall_costs_the_penalty_only() -> None:
 # Training
 
 
+@pytest.mark.slow
 def test_relabelled_rewards_agree_with_the_environment_and_keep_the_penalty() -> None:
     algorithm = make_algorithm(ExpertSettings.of("reach", "sac_her", options=SMALL), "cpu")
     algorithm.learn(100)
@@ -235,6 +236,7 @@ def test_what_was_written_is_restored_exactly(trained: Path) -> None:
     algorithm.get_env().close()
 
 
+@pytest.mark.slow
 def test_training_goes_on_after_an_interruption_from_the_last_whole_checkpoint(
     expert: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

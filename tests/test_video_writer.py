@@ -29,6 +29,7 @@ def episode(grey: int) -> dict[str, np.ndarray]:
     }
 
 
+@pytest.mark.slow
 def test_pictures_and_numbers_read_back(tmp_path: Path) -> None:
     root = tmp_path / "new" / "d"
     assert write_video_dataset(root, SPEC, iter([episode(20), episode(120)])) == 2
