@@ -194,7 +194,7 @@ class GuidedPolicyFigures:
         shape = (n_chunks, self._config.horizon, self._config.action_feature.shape[0])
         noise = torch.randn(shape, generator=torch.Generator().manual_seed(self._seed))
         traces = []
-        for guide in (None, self._policy.make_guide(batch)):
+        for guide in (None, self._policy.guidance.guide(batch, noise.device)):
             trace = _Trace(guide)
             self._policy.reset()
             self._policy.predict_action_chunk(batch, noise=noise, guide=trace)
