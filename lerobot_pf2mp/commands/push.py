@@ -44,9 +44,9 @@ class PushConfig:
 
 def main(config: PushConfig) -> None:
     """Runs the command."""
+    path, repo_id = given("--path", config.path).expanduser(), given("--repo_id", config.repo_id)
     from lerobot_pf2mp.hub.publish_checkpoint import publish_checkpoint
 
-    path, repo_id = given("--path", config.path).expanduser(), given("--repo_id", config.repo_id)
     url = publish_checkpoint(
         path,
         repo_id,

@@ -21,8 +21,11 @@ from torch import Tensor
 
 from lerobot_pf2mp import figures
 from lerobot_pf2mp.benchmark.prior_noise import seeded_prior_noise
-from lerobot_pf2mp.envs.configs import MAZE_TASKS, PF2MPFetchEnv, PF2MPHandwritingEnv, PF2MPMazeEnv
+from lerobot_pf2mp.envs.configs.fetch import PF2MPFetchEnv
+from lerobot_pf2mp.envs.configs.handwriting import PF2MPHandwritingEnv
+from lerobot_pf2mp.envs.configs.maze import PF2MPMazeEnv
 from lerobot_pf2mp.envs.maze.point_maze import parse_maze_map
+from lerobot_pf2mp.envs.tasks import MAZE_TASKS
 from lerobot_pf2mp.figures import Path2D, PathPair, Scene
 from lerobot_pf2mp.figures.comparison_video import write_comparison
 from lerobot_pf2mp.loading import load_policy

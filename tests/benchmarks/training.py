@@ -38,10 +38,10 @@ from torch.utils.data import DataLoader
 from torch.utils.data.dataloader import _BaseDataLoaderIter
 
 from lerobot_pf2mp import PF2MPConfig
+from lerobot_pf2mp.commands import train as pf2mp_train
 from lerobot_pf2mp.dataset_tools.maze.collect_maze import collect_maze
 from lerobot_pf2mp.policies.fmp.modeling_fmp import FMPPolicy
 from lerobot_pf2mp.policies.guided.field_guidance import FieldGuidance
-from lerobot_pf2mp.training import train as pf2mp_train
 from lerobot_pf2mp.training.in_memory_dataset import InMemoryDataset
 
 N_EPISODES = 300
