@@ -29,7 +29,7 @@ _GENERATES = {
     "dppf": "It is LeRobot's Diffusion Policy, whose denoising turns noise into a chunk of actions.",
 }
 _GUIDED = (
-    "On the way a potential field, fitted to the demonstrated actions alone, steers every action back to where the "
+    "While it does so, a potential field, fitted to the demonstrated actions alone, steers every action back to where the "
     "demonstrations went, and so away from obstacles that nobody has modelled. The field is part of this repository and "
     "comes with the preprocessor; `--policy.guidance_scale=0` turns it off. The method is *Towards Safe Imitation Learning "
     "via Potential Field-Guided Flow Matching* (Ding et al., IROS 2025, [arXiv:2508.08707]"
@@ -38,7 +38,7 @@ _GUIDED = (
 _LIMITS = (
     "Obstacles must be where they were in the demonstrations, and demonstrations must cover the free space that is needed: "
     "what was never visited counts as unsafe.",
-    "The field sees single actions, not the way from one to the next.",
+    "The field sees single actions, not the path from one to the next.",
     "It is guidance, not a guarantee: collisions become rare, not impossible. Do not rely on it where people could be hurt.",
 )
 _UNGUIDED_LIMITS = ("It imitates the demonstrations and knows nothing of obstacles or of limits of a robot.",)

@@ -20,7 +20,7 @@ from lerobot_pf2mp.policies.without_peft import WithoutPEFT
 
 
 class DPPFPolicy(WithoutPEFT, WithModelCard, DiffusionPolicy):
-    """Differs from `DiffusionPolicy` in three places, like `PF2MPPolicy` from `FMPPolicy`.
+    """Differs from `DiffusionPolicy` in three points, like `PF2MPPolicy` from `FMPPolicy`.
 
     These are what training shows the field, the bent denoising, and the checked plan. The weights are those of
     `DiffusionPolicy`, and with ``guidance_scale=0`` so are the actions.

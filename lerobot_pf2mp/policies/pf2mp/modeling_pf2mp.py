@@ -15,7 +15,7 @@ from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
 
 
 class PF2MPPolicy(FMPPolicy):
-    """Differs from `FMPPolicy` in three places: what training shows the field, the bent flow, and the checked plan.
+    """Differs from `FMPPolicy` in three points: what training shows the field, the bent flow, and the checked plan.
 
     The weights are those of `FMPPolicy`, and with ``guidance_scale=0`` so are the actions. An observation passes
 
