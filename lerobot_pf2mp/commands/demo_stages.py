@@ -19,7 +19,8 @@ from lerobot_pf2mp.envs.tasks import MAZE_STEPS, MAZE_TASKS
 from lerobot_pf2mp.figures.policy_figures import GuidedPolicyFigures
 from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
 from lerobot_pf2mp.results.rate import Rate
-from lerobot_pf2mp.results.rows import NO_GUIDANCE, EpisodeRow, SummaryRow, summarise, write_rows
+from lerobot_pf2mp.results.rows import NO_GUIDANCE, EpisodeRow, SummaryRow, write_rows
+from lerobot_pf2mp.results.summary import summarise
 
 _MODULES = {
     "pf2mp-train": "lerobot_pf2mp.commands.train",
