@@ -25,7 +25,7 @@ from torch import Tensor
 from lerobot_pf2mp.density.bandwidth import check_bandwidth, select_bandwidth
 from lerobot_pf2mp.density.kernel_sums import KernelSums
 from lerobot_pf2mp.density.kernel_tree import KernelTree
-from lerobot_pf2mp.density.kernels import PAIRS_PER_BLOCK, log_kernels
+from lerobot_pf2mp.density.kernels import offsets_to_nearest
 
 # What a field is fitted with unless somebody says otherwise.
 BANDWIDTH = "likelihood"
@@ -183,7 +183,9 @@ class PotentialField:
         else:
             # Without a look at the values, for which a GPU would have to be waited for.
             is_unsafe = self.log_density(queries) <= self.log_threshold
-            offsets = torch.where(is_unsafe.unsqueeze(-1), self._offset_to_safe_anchor(queries), 0.0)
+            offsets = torch.where(
+                is_unsafe.unsqueeze(-1), offsets_to_nearest(queries, self._safe_anchors, self.bandwidth), 0.0
+            )
         return offsets.reshape(a.shape)
 
     @torch.no_grad()
@@ -265,16 +267,6 @@ class PotentialField:
     @cached_property
     def _safe_tree(self) -> KernelTree:
         return KernelTree.of(self._safe_anchors, self.bandwidth)
-
-    def _offset_to_safe_anchor(self, queries: Tensor) -> Tensor:
-        # Float32 resolves differences between actions, not their common offset.
-        centre = self._safe_anchors[0]
-        anchors = self._safe_anchors - centre
-        nearest = [
-            anchors[log_kernels(block, anchors, self.bandwidth).argmax(dim=-1)] - block
-            for block in (queries - centre).split(max(1, PAIRS_PER_BLOCK // len(anchors)))
-        ]
-        return torch.cat(nearest)
 
     def _flatten(self, a: Tensor) -> Tensor:
         if a.ndim < 1 or a.shape[-1] != self.dim:

@@ -33,6 +33,19 @@ def log_kernels(queries: Tensor, anchors: Tensor, bandwidth: float) -> Tensor:
         return squares.neg_()
 
 
+def offsets_to_nearest(queries: Tensor, anchors: Tensor, bandwidth: float) -> Tensor:
+    """The offsets ``(Q, D)`` from queries ``(Q, D)`` to their nearest anchors, of ``(M, D)``, in blocks of pairs."""
+    # Float32 resolves differences between points, not their common offset.
+    centre = anchors[0]
+    centred = anchors - centre
+    return torch.cat(
+        [
+            centred[log_kernels(block, centred, bandwidth).argmax(dim=-1)] - block
+            for block in (queries - centre).split(max(1, PAIRS_PER_BLOCK // len(anchors)))
+        ]
+    )
+
+
 def mean(points: Tensor) -> Tensor:
     """The mean ``(D,)`` of points ``(M, D)`` in double precision, which not every device has, as float32."""
     return points.cpu().double().mean(dim=0).float().to(points.device)
