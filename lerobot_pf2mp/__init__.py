@@ -1,15 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """Potential-field-guided flow matching policies for LeRobot.
 
-Importing this package registers the policies, their processor step and the environments with LeRobot and Gymnasium.
+Importing this package registers the policies, their processor step and the environments with LeRobot and Gymnasium. It
+imports neither of them, nor torch: what is named here is imported when it is first used.
 """
 
-from lerobot_pf2mp.envs import PF2MPFetchEnv, PF2MPHandwritingEnv, PF2MPMazeEnv
-from lerobot_pf2mp.loading import load_policy
-from lerobot_pf2mp.policies.dppf.configuration_dppf import DPPFConfig
-from lerobot_pf2mp.policies.fmp.configuration_fmp import FMPConfig
-from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
-from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from lerobot_pf2mp._autodiscover.registration import register
+
+if TYPE_CHECKING:
+    from lerobot_pf2mp.envs.configs.fetch import PF2MPFetchEnv
+    from lerobot_pf2mp.envs.configs.handwriting import PF2MPHandwritingEnv
+    from lerobot_pf2mp.envs.configs.maze import PF2MPMazeEnv
+    from lerobot_pf2mp.loading import load_policy
+    from lerobot_pf2mp.policies.dppf.configuration_dppf import DPPFConfig
+    from lerobot_pf2mp.policies.fmp.configuration_fmp import FMPConfig
+    from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
+    from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
 
 __version__ = "0.1.0"
 
@@ -23,3 +32,26 @@ __all__ = [
     "PotentialFieldProcessorStep",
     "load_policy",
 ]
+
+_MODULES = {
+    "DPPFConfig": "policies.dppf.configuration_dppf",
+    "FMPConfig": "policies.fmp.configuration_fmp",
+    "PF2MPConfig": "policies.pf2mp.configuration_pf2mp",
+    "PF2MPFetchEnv": "envs.configs.fetch",
+    "PF2MPHandwritingEnv": "envs.configs.handwriting",
+    "PF2MPMazeEnv": "envs.configs.maze",
+    "PotentialFieldProcessorStep": "policies.guided.potential_field_step",
+    "load_policy": "loading",
+}
+
+register()
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -15,7 +15,7 @@ from lerobot.processor import PolicyAction, PolicyProcessorPipeline
 
 from lerobot_pf2mp.errors import explained
 from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
-from lerobot_pf2mp.policies.guided.modeling_guided import fitted_field
+from lerobot_pf2mp.policies.guided.field_guidance import fitted_field
 from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
 from lerobot_pf2mp.potential_field import PotentialField
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The potential field of Section IV-B: where the demonstrations went, as a density, and which way is back there.
+"""The potential field of Section IV-B: the density of demonstrated actions, and the direction in which it rises.
 
 Everything lives in the space in which the policy generates (normalised actions). With M anchors x_i, demonstrated
 actions drawn at random, and a bandwidth h:
@@ -22,11 +22,44 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from lerobot_pf2mp.density.bandwidth import check_bandwidth, select_bandwidth
 from lerobot_pf2mp.density.kernel_sums import KernelSums
 from lerobot_pf2mp.density.kernel_tree import KernelTree
-from lerobot_pf2mp.density.kernels import PAIRS_PER_BLOCK, check_bandwidth, log_kernels, select_bandwidth
+from lerobot_pf2mp.density.kernels import offsets_to_nearest
+
+# What a field is fitted with unless somebody says otherwise.
+BANDWIDTH = "likelihood"
+THRESHOLD_QUANTILE = 0.01
 
 _TINY = torch.finfo(torch.float32).tiny
+
+
+def check_alpha(alpha: float, name: str = "alpha") -> None:
+    """Checks the weight of the distance term, which has the paper's sign.
+
+    Args:
+        alpha: The weight.
+        name: What the user calls it.
+
+    Raises:
+        ValueError: If it is not finite or above 0.
+    """
+    if not (alpha <= 0 and math.isfinite(alpha)):
+        raise ValueError(f"{name} must be finite and at most 0, got {alpha}")
+
+
+def check_threshold_quantile(quantile: float, name: str = "threshold_quantile") -> None:
+    """Checks the quantile that bounds the safe set.
+
+    Args:
+        quantile: The quantile.
+        name: What the user calls it.
+
+    Raises:
+        ValueError: If it does not lie in [0, 1].
+    """
+    if not 0 <= quantile <= 1:
+        raise ValueError(f"{name} must lie in [0, 1], got {quantile}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +94,7 @@ class PotentialField:
         check_bandwidth(self.bandwidth)
         if math.isnan(self.log_threshold):
             raise ValueError("log_threshold must be a number, got nan")
-        if not self.alpha <= 0 or math.isinf(self.alpha):
-            raise ValueError(f"alpha must be finite and at most 0 (the paper's sign), got {self.alpha}")
+        check_alpha(self.alpha)
         object.__setattr__(self, "anchors", self.anchors.detach().float().contiguous())
 
     @property
@@ -151,17 +183,19 @@ class PotentialField:
         else:
             # Without a look at the values, for which a GPU would have to be waited for.
             is_unsafe = self.log_density(queries) <= self.log_threshold
-            offsets = torch.where(is_unsafe.unsqueeze(-1), self._offset_to_safe_anchor(queries), 0.0)
+            offsets = torch.where(
+                is_unsafe.unsqueeze(-1), offsets_to_nearest(queries, self._safe_anchors, self.bandwidth), 0.0
+            )
         return offsets.reshape(a.shape)
 
     @torch.no_grad()
-    def step_to_safety(self, a: Tensor, share: float, reach: float) -> Tensor:
-        """The step that takes an action towards its local mean, and on from there towards the safe set H.
+    def step_to_safety(self, a: Tensor, share: float, max_distance: float) -> Tensor:
+        """The step that moves an action towards its local mean, and from there towards the safe set H.
 
         Args:
             a: ``(..., D)`` actions [normalised].
-            share: In [0, 1], how much of the way to the local mean.
-            reach: How far at most towards H [normalised].
+            share: Which share of the mean shift is taken, in [0, 1].
+            max_distance: Largest distance to move towards H after that [normalised].
 
         Returns:
             ``(..., D)`` steps [normalised].
@@ -169,12 +203,12 @@ class PotentialField:
         queries = self._flatten(a)
         if self._sums.has_tree:
             tree, log_sum = self._sums.tree, self._log_sum_threshold
-            steps = tree.steps_to(self._safe_tree, queries, log_sum, share, reach)
+            steps = tree.steps_to(self._safe_tree, queries, log_sum, share, max_distance)
         else:
             steps = share * self.mean_shift(queries)
             offset = self.offset_to_safe_set(queries + steps)
-            distance = offset.norm(dim=-1, keepdim=True).clamp_min(max(reach, _TINY))
-            steps = steps.addcdiv_(offset, distance, value=reach)
+            distance = offset.norm(dim=-1, keepdim=True).clamp_min(max(max_distance, _TINY))
+            steps = steps.addcdiv_(offset, distance, value=max_distance)
         return steps.reshape(a.shape)
 
     def potential(self, a: Tensor) -> Tensor:
@@ -234,17 +268,6 @@ class PotentialField:
     def _safe_tree(self) -> KernelTree:
         return KernelTree.of(self._safe_anchors, self.bandwidth)
 
-    def _offset_to_safe_anchor(self, queries: Tensor) -> Tensor:
-        centre = self._safe_anchors[
-            0
-        ]  # float32 resolves differences between actions, not their common offset
-        anchors = self._safe_anchors - centre
-        nearest = [
-            anchors[log_kernels(block, anchors, self.bandwidth).argmax(dim=-1)] - block
-            for block in (queries - centre).split(max(1, PAIRS_PER_BLOCK // len(anchors)))
-        ]
-        return torch.cat(nearest)
-
     def _flatten(self, a: Tensor) -> Tensor:
         if a.ndim < 1 or a.shape[-1] != self.dim:
             raise ValueError(
@@ -256,8 +279,8 @@ class PotentialField:
 def fit(
     points: Tensor,
     *,
-    bandwidth: float | str = "likelihood",
-    threshold_quantile: float = 0.01,
+    bandwidth: float | str = BANDWIDTH,
+    threshold_quantile: float = THRESHOLD_QUANTILE,
     alpha: float = 0.0,
     n_anchors: int | None = None,
     generator: torch.Generator | None = None,
@@ -278,8 +301,7 @@ def fit(
     Raises:
         ValueError: If the points are not a finite ``(P, D)`` tensor, or an argument breaks its rule.
     """
-    if not 0 <= threshold_quantile <= 1:
-        raise ValueError(f"threshold_quantile must lie in [0, 1], got {threshold_quantile}")
+    check_threshold_quantile(threshold_quantile)
     if points.ndim != 2 or points.shape[0] < 1 or points.shape[1] < 1:
         raise ValueError(f"points must have shape (P, D) with P, D >= 1, got {tuple(points.shape)}")
     if not torch.isfinite(points).all():

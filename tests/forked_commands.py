@@ -50,6 +50,7 @@ _IMPORTED_BEFORE = [
     "lerobot_pf2mp.commands.plot",
     "lerobot_pf2mp.commands.policy_server",
     "lerobot_pf2mp.commands.push",
+    "lerobot_pf2mp.commands.train",
     "lerobot_pf2mp.commands.train_expert",
     "lerobot_pf2mp.training.train",
 ]

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from lerobot_pf2mp.results.rows import Cell, EpisodeRow, SummaryRow
+from lerobot_pf2mp.results.rows import EpisodeRow, SummaryRow
+from lerobot_pf2mp.results.summary import Cell
 
 GUIDED = {"policy": "pf2mp", "guidance_integrator": "proximal", "guidance_scale": 0.8}
 UNGUIDED = {"policy": "fmp", "guidance_integrator": "none", "guidance_scale": 0.0}

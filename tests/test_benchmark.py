@@ -32,8 +32,8 @@ from lerobot_pf2mp.benchmark.run import run_benchmark
 from lerobot_pf2mp.benchmark.spec import NONE, BenchmarkSpec, Guidance
 from lerobot_pf2mp.envs.maze.maze_env import MazeEnv
 from lerobot_pf2mp.errors import ConfigError
-from lerobot_pf2mp.policies.dppf.modeling_dppf import DPPFPolicy
 from lerobot_pf2mp.policies.fmp import modeling_fmp
+from lerobot_pf2mp.policies.guided.field_guidance import FieldGuidance
 from lerobot_pf2mp.policies.pf2mp.modeling_pf2mp import PF2MPPolicy
 from lerobot_pf2mp.results.rows import SummaryRow, read_rows
 
@@ -395,25 +395,24 @@ def test_options_of_every_type_can_be_changed(checkpoints: dict[str, str], optio
     assert {name: getattr(policy.config, name) for name in options} == options
 
 
-@pytest.mark.parametrize(("kind", "policy_class"), [("pf2mp", PF2MPPolicy), ("dppf", DPPFPolicy)])
+@pytest.mark.parametrize("kind", ["pf2mp", "dppf"])
 def test_every_kind_of_guidance_is_the_one_that_acts(
     checkpoints: dict[str, str],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     kind: str,
-    policy_class: type,
 ) -> None:
     acted: list[tuple[str, float]] = []
-    make_guide = policy_class.make_guide
+    make_guide = FieldGuidance.guide
 
-    def recorded(self: Any, batch: dict) -> Any:
-        guide = make_guide(self, batch)
+    def recorded(self: Any, batch: dict, device: torch.device) -> Any:
+        guide = make_guide(self, batch, device)
         kind_of_guide = type(guide).__name__, getattr(guide, "scale", 0.0)
         if kind_of_guide not in acted[-1:]:
             acted.append(kind_of_guide)
         return guide
 
-    monkeypatch.setattr(policy_class, "make_guide", recorded)
+    monkeypatch.setattr(FieldGuidance, "guide", recorded)
     guidances = ("euler:0.01", "none", "proximal:0.8,0.08", "euler:0.02")
     run(spec_of({kind: checkpoints[kind]}, *guidances), tmp_path)
     assert acted == [

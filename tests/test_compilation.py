@@ -13,7 +13,8 @@ from lerobot_pf2mp import FMPConfig, PF2MPConfig
 from lerobot_pf2mp.density import kernel_tree
 from lerobot_pf2mp.density.kernel_sums import KernelSums
 from lerobot_pf2mp.policies.fmp.modeling_fmp import FMPPolicy
-from lerobot_pf2mp.policies.guided.potential_field_step import POTENTIAL_FIELD, DemonstratedActions
+from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
+from lerobot_pf2mp.policies.guided.potential_field_step import POTENTIAL_FIELD
 from lerobot_pf2mp.policies.pf2mp.modeling_pf2mp import PF2MPPolicy
 from lerobot_pf2mp.potential_field import PotentialField, fit
 
@@ -104,7 +105,7 @@ def test_a_compiled_policy_plans_the_same_and_is_compiled_once(kind: str, option
 def test_the_steps_of_a_guided_policy_are_one_graph(sums: str) -> None:
     policy = policy_of("pf2mp")
     (batch,), (noise,) = batches_for(policy, 1), noises(1)
-    guide = policy.make_guide(batch)
+    guide = policy.guidance.guide(batch, torch.device("cpu"))
     compiled = torch.compile(policy.predict_action_chunk, backend="eager", fullgraph=True)
     chunk = compiled({STATE: batch[STATE]}, noise=noise, guide=guide)
     torch.testing.assert_close(chunk, policy.predict_action_chunk(batch, noise=noise), rtol=1e-4, atol=1e-5)

@@ -23,7 +23,8 @@ from lerobot_pf2mp.dataset_tools.maze.collect_maze import collect_maze
 from lerobot_pf2mp.errors import ConfigError
 from lerobot_pf2mp.guidance import GUIDANCE_INTEGRATORS, GUIDANCE_POINTS, EulerGuide, ProximalGuide
 from lerobot_pf2mp.policies.dppf.modeling_dppf import DPPFPolicy
-from lerobot_pf2mp.policies.guided.potential_field_step import POTENTIAL_FIELD, DemonstratedActions
+from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
+from lerobot_pf2mp.policies.guided.potential_field_step import POTENTIAL_FIELD
 
 STATE, ENV, ACTION = "observation.state", "observation.environment_state", "action"
 FRONT = "observation.images.front"
@@ -238,7 +239,7 @@ def test_guidance_raises_the_log_density_of_the_actions(scheduler, integrator, p
 def test_the_configured_guide_is_made_over_the_field_of_the_batch(integrator, kind, point):
     policy = dppf(guidance_scale=0.3, guidance_integrator=integrator, guidance_point=point)
     shown = demonstrations(policy)
-    guide = policy.make_guide({POTENTIAL_FIELD: shown})
+    guide = policy.guidance.guide({POTENTIAL_FIELD: shown}, torch.device("cpu"))
     default = {"euler": "current", "proximal": "end"}[integrator]
     assert isinstance(guide, kind)
     assert (guide.scale, guide.point) == (0.3, point or default)
@@ -549,7 +550,7 @@ def test_options_of_the_sampler_and_of_guidance_can_be_changed_when_loading(tmp_
     policy.predict_action_chunk(batch)
     assert len(calls) == 3
     assert type(policy.diffusion.noise_scheduler).__name__ == "DDPMScheduler"
-    guide = policy.make_guide(batch)
+    guide = policy.guidance.guide(batch, torch.device("cpu"))
     assert isinstance(guide, EulerGuide)
     assert (guide.scale, guide.point) == (0.1, "end")
     assert guide.field.bandwidth == 0.7

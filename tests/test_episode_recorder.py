@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, freeze_after_episode_end
 
+from lerobot_pf2mp import PF2MPMazeEnv
 from lerobot_pf2mp.benchmark.episode_recorder import Episode, EpisodeRecorder
-from lerobot_pf2mp.envs import PF2MPMazeEnv
 
 NEW_ROLLOUT = {NEW_ROLLOUT_OPTION: True}
 

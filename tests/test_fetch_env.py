@@ -26,7 +26,8 @@ from scipy.optimize import nnls
 from scipy.spatial import ConvexHull
 from torch import nn
 
-from lerobot_pf2mp.envs import FETCH_TASKS, PF2MPFetchEnv, headless
+from lerobot_pf2mp import PF2MPFetchEnv
+from lerobot_pf2mp.envs import headless
 from lerobot_pf2mp.envs.fetch.fetch_env import FetchEnv
 from lerobot_pf2mp.envs.fetch.fetch_scene import (
     BLOCK_SIZE,
@@ -38,6 +39,7 @@ from lerobot_pf2mp.envs.fetch.fetch_scene import (
     WORKSPACE,
 )
 from lerobot_pf2mp.envs.headless import rendering
+from lerobot_pf2mp.envs.tasks import FETCH_TASKS
 from lerobot_pf2mp.errors import ConfigError
 
 TASKS = ("reach", "push")

@@ -32,7 +32,7 @@ from lerobot_pf2mp import load_policy
 from lerobot_pf2mp.commands import cli
 from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, write_dataset
 from lerobot_pf2mp.fit_field import GUIDED_TYPES, fit_field
-from lerobot_pf2mp.policies.guided.potential_field_step import DemonstratedActions
+from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
 
 BIN = Path(sys.executable).parent
 SECONDS = 600  # for a command, on a machine that is busy with other things
@@ -375,7 +375,8 @@ def test_options_that_are_given_take_effect_and_the_others_stay(name, checkpoint
     points = field_of(new)["points"]
     assert torch.equal(points, field_of(fitted(name))["points"][:11, 1:])
     policy, preprocess, _ = load_policy(new, device="cpu")
-    guide = policy.make_guide(preprocess({STATE: torch.zeros(1, 2), ENV: torch.zeros(1, 2)}))
+    batch = preprocess({STATE: torch.zeros(1, 2), ENV: torch.zeros(1, 2)})
+    guide = policy.guidance.guide(batch, torch.device("cpu"))
     assert (guide.dims.tolist(), guide.guide.scale) == ([1], 0.25)
     assert torch.equal(guide.guide.field.anchors, points)
     assert (guide.guide.field.bandwidth, guide.guide.field.alpha) == (0.4, -2.0)
@@ -731,7 +732,10 @@ def test_a_missing_option_is_named(option, checkpoint, shown, tmp_path, refused)
     ("option", "message"),
     [
         ("--policy.field_bandwidth=-1", "field_bandwidth must be finite and positive, got -1.0"),
-        ("--policy.field_bandwidth=wide", "field_bandwidth must be one of .* or a number, got 'wide'"),
+        (
+            "--policy.field_bandwidth=wide",
+            "field_bandwidth must be one of .* or a positive number, got 'wide'",
+        ),
         ("--policy.n_field_points=0", "n_field_points must be at least 1, got 0"),
         ("--policy.n_field_points=many", "`policy.n_field_points`: Could"),
         (

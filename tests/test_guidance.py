@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import math
+from collections.abc import Sequence
 
 import pytest
 import torch
@@ -7,9 +8,11 @@ from lerobot.configs import FeatureType, PolicyFeature
 
 from lerobot_pf2mp import PF2MPConfig
 from lerobot_pf2mp.errors import ConfigError
-from lerobot_pf2mp.flow_matching import integrate
-from lerobot_pf2mp.guidance import GUIDANCE_INTEGRATORS, GUIDANCE_POINTS, make_guide
-from lerobot_pf2mp.policies.guided.potential_field_step import POTENTIAL_FIELD, DemonstratedActions
+from lerobot_pf2mp.flow_matching import Guide, integrate
+from lerobot_pf2mp.guidance import GUIDANCE_INTEGRATORS, GUIDANCE_POINTS, GuidanceSettings, make_guide
+from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
+from lerobot_pf2mp.policies.guided.field_guidance import FieldGuidance
+from lerobot_pf2mp.policies.guided.potential_field_step import POTENTIAL_FIELD
 from lerobot_pf2mp.policies.pf2mp.modeling_pf2mp import PF2MPPolicy
 from lerobot_pf2mp.potential_field import PotentialField, fit
 
@@ -18,19 +21,30 @@ def random_field(dim: int = 2, alpha: float = 0.0, bandwidth: float = 0.2) -> Po
     return fit(torch.randn(200, dim), bandwidth=bandwidth, threshold_quantile=0.2, alpha=alpha)
 
 
+def guide_of(
+    field: PotentialField,
+    scale: float,
+    integrator: str = "proximal",
+    action_dims: Sequence[int] | None = None,
+    point: str | None = None,
+) -> Guide | None:
+    dims = None if action_dims is None else tuple(action_dims)
+    return make_guide(field, GuidanceSettings(scale, integrator, point, dims))
+
+
 @pytest.mark.parametrize("alpha", [0.0, -3.0])
 def test_the_euler_guide_is_algorithm_2_as_printed(alpha):
     field, scale, dt = random_field(3, alpha), 0.05, 0.2
     x_t, v = 2 * torch.randn(4, 8, 3), torch.randn(4, 8, 3)
     phi = field.potential_gradient(x_t)
-    guided = make_guide(field, scale, "euler")(x_t, x_t + v * dt, x_t + v, dt)
+    guided = guide_of(field, scale, "euler")(x_t, x_t + v * dt, x_t + v, dt)
     torch.testing.assert_close(guided, x_t + (v + scale * phi) * dt, rtol=1e-5, atol=1e-5)
 
 
 def test_a_whole_euler_integration_is_algorithm_2_as_printed():
     field, scale = random_field(2, -1.0), 0.02
     a = torch.randn(4, 8, 2)
-    guided = integrate(lambda x, t: -x, a, 5, guide=make_guide(field, scale, "euler"))
+    guided = integrate(lambda x, t: -x, a, 5, guide=guide_of(field, scale, "euler"))
     for _ in range(5):
         a = a + (-a + scale * field.potential_gradient(a)) * 0.2
     torch.testing.assert_close(guided, a, rtol=1e-4, atol=1e-5)
@@ -38,8 +52,8 @@ def test_a_whole_euler_integration_is_algorithm_2_as_printed():
 
 @pytest.mark.parametrize("integrator", GUIDANCE_INTEGRATORS)
 def test_no_guidance_is_no_guide(integrator):
-    assert make_guide(random_field(), 0, integrator) is None
-    assert make_guide(random_field(), 0.0, integrator, [0]) is None
+    assert guide_of(random_field(), 0, integrator) is None
+    assert guide_of(random_field(), 0.0, integrator, [0]) is None
 
 
 def test_the_proximal_step_solves_the_guidance_equation_with_the_local_mean_held_fixed():
@@ -48,7 +62,7 @@ def test_the_proximal_step_solves_the_guidance_equation_with_the_local_mean_held
     mean, fine = field.local_mean(x).double(), x.double()
     for _ in range(20_000):
         fine = fine + scale * dt / 20_000 * (mean - fine) / field.bandwidth**2
-    torch.testing.assert_close(make_guide(field, scale)(x, x, x, dt).double(), fine, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(guide_of(field, scale)(x, x, x, dt).double(), fine, rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize("alpha", [0.0, -3.0])
@@ -60,7 +74,7 @@ def test_the_proximal_step_tends_to_the_euler_step_as_lambda_tends_to_zero(alpha
         x = torch.randn(100, 2)
     difference, step = [], []
     for scale in (1e-2, 1e-3):
-        euler, proximal = (make_guide(field, scale, name)(x, x, x, 0.2) for name in ("euler", "proximal"))
+        euler, proximal = (guide_of(field, scale, name)(x, x, x, 0.2) for name in ("euler", "proximal"))
         difference.append((euler - proximal).norm().item())
         step.append((euler - x).norm().item())
     assert len(x) > 5
@@ -73,7 +87,7 @@ def test_the_proximal_step_tends_to_the_euler_step_as_lambda_tends_to_zero(alpha
 def test_the_proximal_step_stays_among_the_anchors_however_large_lambda(scale):
     field = random_field(3)
     x_t, x_next = torch.randn(50, 3), 2 * torch.randn(50, 3)
-    guided = make_guide(field, scale)(x_t, x_next, x_next, 0.2)
+    guided = guide_of(field, scale)(x_t, x_next, x_next, 0.2)
     mean = field.local_mean(x_next)
     decay = math.exp(-scale * 0.2 / field.bandwidth**2)
     torch.testing.assert_close(guided - mean, decay * (x_next - mean), rtol=1e-4, atol=1e-5)
@@ -87,7 +101,7 @@ def test_the_euler_guide_diverges_where_the_proximal_one_does_not():
     field, x_0 = random_field(), torch.randn(50, 2)
     for scale in (1.0, 1e6):
         euler, proximal = (
-            integrate(lambda x, t: -x, x_0, 5, guide=make_guide(field, scale, name))
+            integrate(lambda x, t: -x, x_0, 5, guide=guide_of(field, scale, name))
             for name in ("euler", "proximal")
         )
         assert not (euler.abs().amax() < 100)
@@ -99,8 +113,8 @@ def test_the_proximal_distance_step_ends_at_most_at_the_safe_anchor(scale):
     field, dt = random_field(2, -2.0, bandwidth=0.1), 0.2
     without = PotentialField(field.anchors, field.bandwidth, field.log_threshold)
     x = 3 * torch.randn(100, 2)
-    before = make_guide(without, scale)(x, x, x, dt)
-    after = make_guide(field, scale)(x, x, x, dt)
+    before = guide_of(without, scale)(x, x, x, dt)
+    after = guide_of(field, scale)(x, x, x, dt)
     offset = field.offset_to_safe_set(before)
     moved = after - before
     assert (offset.norm(dim=-1) > 0).any()
@@ -113,7 +127,7 @@ def test_the_proximal_distance_step_ends_at_most_at_the_safe_anchor(scale):
 
 def test_a_tiny_alpha_does_not_divide_zero_by_zero():
     field = random_field(2, -1e-30)
-    guided = make_guide(field, 1e-20)(field.anchors, field.anchors, field.anchors, 0.2)
+    guided = guide_of(field, 1e-20)(field.anchors, field.anchors, field.anchors, 0.2)
     torch.testing.assert_close(guided, field.anchors)
 
 
@@ -122,7 +136,7 @@ def test_a_tiny_alpha_does_not_divide_zero_by_zero():
 def test_a_guided_step_raises_the_log_density(integrator, scale, alpha):
     field = random_field(2, alpha)
     x = torch.cat([2 * torch.randn(200, 2), 10 * torch.randn(200, 2)])
-    guided = make_guide(field, scale, integrator)(x, x, x, 0.2)
+    guided = guide_of(field, scale, integrator)(x, x, x, 0.2)
     unsafe = field.offset_to_safe_set(x).norm(dim=-1) > 0.1
     assert unsafe.sum() > 200
     assert (field.log_density(guided) > field.log_density(x))[unsafe].all()
@@ -136,8 +150,8 @@ def test_dimensions_without_a_field_pass_bit_for_bit(integrator, dims):
     field = random_field(len(dims), -1.0)
     x_t, x_next = torch.randn(4, 8, 4), torch.randn(4, 8, 4)
     before = x_next.clone()
-    guided = make_guide(field, 0.05, integrator, dims)(x_t, x_next, x_next, 0.2)
-    alone = make_guide(field, 0.05, integrator)(x_t[..., list(dims)], *2 * [x_next[..., list(dims)]], 0.2)
+    guided = guide_of(field, 0.05, integrator, dims)(x_t, x_next, x_next, 0.2)
+    alone = guide_of(field, 0.05, integrator)(x_t[..., list(dims)], *2 * [x_next[..., list(dims)]], 0.2)
     others = [dim for dim in range(4) if dim not in dims]
     assert torch.equal(guided[..., others], x_next[..., others])
     assert torch.equal(guided[..., list(dims)], alone)
@@ -163,9 +177,9 @@ def test_the_guidance_points_are_the_start_the_predicted_end_and_the_next_sample
 def test_the_default_point_of_each_integrator_can_be_named(integrator, default, dims, alpha):
     field, x = random_field(2, alpha), three_points()
     step = x["current"], x["next"], x["end"], 0.2
-    unnamed = make_guide(field, 0.05, integrator, dims)(*step)
+    unnamed = guide_of(field, 0.05, integrator, dims)(*step)
     for point in GUIDANCE_POINTS:
-        named = make_guide(field, 0.05, integrator, dims, point)(*step)
+        named = guide_of(field, 0.05, integrator, dims, point)(*step)
         assert torch.equal(named, unnamed) == (point == default)
 
 
@@ -173,7 +187,7 @@ def test_the_default_point_of_each_integrator_can_be_named(integrator, default, 
 @pytest.mark.parametrize("point", GUIDANCE_POINTS)
 def test_the_euler_guide_adds_lambda_dt_times_the_field_at_its_point(point, alpha):
     field, scale, dt, x = random_field(2, alpha), 0.05, 0.2, three_points()
-    guided = make_guide(field, scale, "euler", point=point)(x["current"], x["next"], x["end"], dt)
+    guided = guide_of(field, scale, "euler", point=point)(x["current"], x["next"], x["end"], dt)
     expected = x["next"] + scale * dt * field.potential_gradient(x[point])
     torch.testing.assert_close(guided, expected)
 
@@ -182,7 +196,7 @@ def test_the_euler_guide_adds_lambda_dt_times_the_field_at_its_point(point, alph
 @pytest.mark.parametrize("point", GUIDANCE_POINTS)
 def test_the_proximal_guide_adds_its_share_of_the_mean_shift_at_its_point(point, scale):
     field, dt, x = random_field(), 0.2, three_points()
-    guided = make_guide(field, scale, "proximal", point=point)(x["current"], x["next"], x["end"], dt)
+    guided = guide_of(field, scale, "proximal", point=point)(x["current"], x["next"], x["end"], dt)
     share = 1 - math.exp(-scale * dt / field.bandwidth**2)
     expected = x["next"] + share * (field.local_mean(x[point]) - x[point])
     torch.testing.assert_close(guided, expected, rtol=1e-4, atol=1e-5)
@@ -192,7 +206,7 @@ def test_the_proximal_guide_adds_its_share_of_the_mean_shift_at_its_point(point,
 def test_the_distance_term_of_the_proximal_guide_goes_on_from_its_shifted_point(point):
     field, scale, dt = random_field(2, -2.0, bandwidth=0.1), 0.5, 0.2
     x = {name: 3 * a for name, a in three_points().items()}
-    guided = make_guide(field, scale, "proximal", point=point)(x["current"], x["next"], x["end"], dt)
+    guided = guide_of(field, scale, "proximal", point=point)(x["current"], x["next"], x["end"], dt)
     shift = (1 - math.exp(-scale * dt / field.bandwidth**2)) * field.mean_shift(x[point])
     offset = field.offset_to_safe_set(x[point] + shift)
     length = offset.norm(dim=-1, keepdim=True)
@@ -205,7 +219,7 @@ def test_the_distance_term_of_the_proximal_guide_goes_on_from_its_shifted_point(
 @pytest.mark.parametrize("n_steps", [1, 5])
 def test_the_predicted_end_is_the_next_sample_on_the_last_step_of_a_flow_and_only_there(integrator, n_steps):
     field, agrees = random_field(2, -1.0), []
-    end, after = (make_guide(field, 0.05, integrator, point=point) for point in ("end", "next"))
+    end, after = (guide_of(field, 0.05, integrator, point=point) for point in ("end", "next"))
 
     def compare(*step):
         agrees.append(torch.equal(end(*step), after(*step)))
@@ -219,9 +233,9 @@ def test_the_predicted_end_is_the_next_sample_on_the_last_step_of_a_flow_and_onl
 @pytest.mark.parametrize("point", GUIDANCE_POINTS)
 def test_a_point_is_asked_for_in_the_dimensions_of_the_field(integrator, point):
     field, x, dims = random_field(2, -1.0), three_points(4), [3, 1]
-    guided = make_guide(field, 0.05, integrator, dims, point)(x["current"], x["next"], x["end"], 0.2)
+    guided = guide_of(field, 0.05, integrator, dims, point)(x["current"], x["next"], x["end"], 0.2)
     covered = {name: a[..., dims] for name, a in x.items()}
-    alone = make_guide(field, 0.05, integrator, point=point)(
+    alone = guide_of(field, 0.05, integrator, point=point)(
         covered["current"], covered["next"], covered["end"], 0.2
     )
     assert torch.equal(guided[..., dims], alone)
@@ -232,9 +246,9 @@ def test_a_point_is_asked_for_in_the_dimensions_of_the_field(integrator, point):
 @pytest.mark.parametrize("scale", [0.0, 0.5])
 def test_an_unknown_guidance_point_is_an_error_that_names_the_choices(integrator, scale):
     with pytest.raises(
-        ValueError, match=r"guidance_point must be one of .*current.*end.*next.* or None, got 'start'"
+        ValueError, match=r"guidance_point must be one of .*current.*end.*next.* or null, got 'start'"
     ):
-        make_guide(random_field(), scale, integrator, point="start")
+        guide_of(random_field(), scale, integrator, point="start")
 
 
 def test_an_unknown_guidance_point_in_a_configuration_is_an_error_that_names_the_choices():
@@ -260,8 +274,62 @@ def test_the_guidance_point_of_the_configuration_is_that_of_the_policys_guide(in
     )
     shown = DemonstratedActions(config.field_settings)
     shown.observe(torch.randn(40, 8, 2), None, None, settings=config.field_settings)
-    guide = PF2MPPolicy(config).make_guide({POTENTIAL_FIELD: shown})
+    guide = PF2MPPolicy(config).guidance.guide({POTENTIAL_FIELD: shown}, torch.device("cpu"))
     assert guide.point == (point or default)
+
+
+def test_a_guide_is_made_once_and_kept_until_the_field_or_a_setting_changes():
+    config = PF2MPConfig(
+        device="cpu",
+        horizon=8,
+        n_action_steps=4,
+        down_dims=(8, 16),
+        diffusion_step_embed_dim=16,
+        input_features={"observation.state": PolicyFeature(FeatureType.STATE, (3,))},
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (2,))},
+    )
+    guidance, cpu = FieldGuidance(config), torch.device("cpu")
+    shown, other = DemonstratedActions(config.field_settings), DemonstratedActions(config.field_settings)
+    for demonstrations in (shown, other):
+        demonstrations.observe(torch.randn(40, 8, 2), None, None, settings=config.field_settings)
+    kept = guidance.guide({POTENTIAL_FIELD: shown}, cpu)
+    assert guidance.guide({POTENTIAL_FIELD: shown}, cpu) is kept
+    assert guidance.guide({POTENTIAL_FIELD: other}, cpu).field is other.field()
+    made = [kept]
+    changes = {
+        "guidance_scale": 0.1,
+        "guidance_integrator": "euler",
+        "guidance_point": "next",
+        "field_alpha": -2.0,
+        "field_bandwidth": 0.3,
+        "field_threshold_quantile": 0.2,
+        "n_field_points": 30,
+        "field_action_dims": [1, 0],
+    }
+    for name, value in changes.items():
+        setattr(config, name, value)
+        if name == "field_action_dims":
+            shown = DemonstratedActions(config.field_settings)
+            shown.observe(torch.randn(40, 8, 2), None, None, settings=config.field_settings)
+        guide = guidance.guide({POTENTIAL_FIELD: shown}, cpu)
+        assert all(guide is not earlier for earlier in made), name
+        assert guidance.guide({POTENTIAL_FIELD: shown}, cpu) is guide
+        made.append(guide)
+
+
+def test_settings_are_validated_once_for_all_plans():
+    config = PF2MPConfig(
+        device="cpu",
+        horizon=8,
+        n_action_steps=4,
+        input_features={"observation.state": PolicyFeature(FeatureType.STATE, (3,))},
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (2,))},
+    )
+    assert config.guidance_settings is config.guidance_settings
+    assert config.field_settings is config.field_settings
+    config.guidance_scale = -1.0
+    with pytest.raises(ValueError, match="guidance_scale must be finite and at least 0, got -1.0"):
+        _ = config.guidance_settings
 
 
 # Rules and modes.
@@ -271,20 +339,20 @@ def test_the_guidance_point_of_the_configuration_is_that_of_the_policys_guide(in
 @pytest.mark.parametrize("scale", [-0.1, math.nan, math.inf])
 def test_a_guidance_scale_that_is_not_finite_and_at_least_zero_is_an_error(integrator, scale):
     with pytest.raises(ValueError, match="guidance_scale must be finite and at least 0, got"):
-        make_guide(random_field(), scale, integrator)
+        guide_of(random_field(), scale, integrator)
 
 
 @pytest.mark.parametrize("scale", [0.0, 0.5])
 def test_an_unknown_guidance_integrator_is_an_error_that_names_the_choices(scale):
     with pytest.raises(ValueError, match=r"guidance_integrator must be one of .*euler.*proximal.*got 'rk4'"):
-        make_guide(random_field(), scale, "rk4")
+        guide_of(random_field(), scale, "rk4")
 
 
 @pytest.mark.parametrize("integrator", GUIDANCE_INTEGRATORS)
 def test_guides_work_under_inference_mode_and_autocast(integrator):
     field = random_field(2, -1.0)
     x_t, x_next = torch.randn(4, 8, 3), torch.randn(4, 8, 3)
-    guide = make_guide(field, 0.05, integrator, [2, 1])
+    guide = guide_of(field, 0.05, integrator, [2, 1])
     expected = guide(x_t, x_next, x_next, 0.2)
     with torch.inference_mode():
         assert torch.equal(guide(x_t, x_next, x_next, 0.2), expected)

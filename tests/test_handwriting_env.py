@@ -23,7 +23,7 @@ from lerobot.envs.utils import NEW_ROLLOUT_OPTION, env_to_policy_features
 from lerobot.scripts.lerobot_eval import rollout
 from torch import nn
 
-from lerobot_pf2mp.envs import HANDWRITING_TASKS, PF2MPHandwritingEnv
+from lerobot_pf2mp import PF2MPHandwritingEnv
 from lerobot_pf2mp.envs.handwriting.handwriting_env import START_SPREAD, HandwritingEnv
 from lerobot_pf2mp.envs.handwriting.ink import COVERED, INK_HEIGHT, LARGEST_ERROR, Ink
 from lerobot_pf2mp.envs.handwriting.letters import LETTERS
@@ -32,6 +32,7 @@ from lerobot_pf2mp.envs.handwriting.regions import Disc
 from lerobot_pf2mp.envs.handwriting.sheet import SHEET_CENTRE, SHEET_SIDE
 from lerobot_pf2mp.envs.handwriting.stroke import evenly_spaced
 from lerobot_pf2mp.envs.handwriting.writing_scene import WritingScene, make_writing_scene
+from lerobot_pf2mp.envs.tasks import HANDWRITING_TASKS
 from lerobot_pf2mp.errors import ConfigError
 
 SPACES = ("joint", "pen")

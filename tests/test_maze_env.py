@@ -18,12 +18,13 @@ from lerobot.envs.utils import env_to_policy_features
 from lerobot.scripts.lerobot_eval import rollout
 from torch import nn
 
+from lerobot_pf2mp import PF2MPMazeEnv
 from lerobot_pf2mp.dataset_tools.maze.maze_expert import MazeExpert
 from lerobot_pf2mp.dataset_tools.writing.episodes import resample
-from lerobot_pf2mp.envs import MAZE_TASKS, PF2MPMazeEnv
 from lerobot_pf2mp.envs.maze.maze_env import MazeEnv
 from lerobot_pf2mp.envs.maze.point_maze import BALL_RADIUS, MAZE_MAPS, make_point_maze, parse_maze_map
 from lerobot_pf2mp.envs.maze.swept_ball import SweptBall
+from lerobot_pf2mp.envs.tasks import MAZE_TASKS
 from lerobot_pf2mp.errors import ConfigError
 
 CONTROLS = ("exact", "pd")

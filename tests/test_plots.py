@@ -21,7 +21,7 @@ from lerobot_pf2mp.envs.box import Box
 from lerobot_pf2mp.figures import THEMES, Path2D, PathPair, Scene
 from lerobot_pf2mp.figures.space import faces
 from lerobot_pf2mp.potential_field import PotentialField, fit
-from lerobot_pf2mp.results.rows import Cell
+from lerobot_pf2mp.results.summary import Cell
 
 SCALE, SHIFT = torch.tensor([2.0, 1.0]), torch.tensor([0.5, -0.5])  # of normalised actions to metres
 MAZE_MAP = [[1, 1, 1, 1], [1, 0, 0, 1], [1, 1, 1, 1]]

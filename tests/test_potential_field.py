@@ -5,10 +5,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from lerobot_pf2mp import potential_field
+from lerobot_pf2mp.density import bandwidth as bandwidths
 from lerobot_pf2mp.density import kernel_sums, kernels
+from lerobot_pf2mp.density.bandwidth import BANDWIDTH_RULES, leave_one_out_log_likelihood, select_bandwidth
 from lerobot_pf2mp.density.kernel_sums import KernelSums
-from lerobot_pf2mp.density.kernels import BANDWIDTH_RULES, leave_one_out_log_likelihood, select_bandwidth
+from lerobot_pf2mp.density.kernels import offsets_to_nearest
 from lerobot_pf2mp.potential_field import PotentialField, fit
 
 # What follows is the specification in its most obvious form: all pairs at once, float64, autograd.
@@ -296,8 +297,7 @@ def test_the_leave_one_out_likelihood_equals_a_float64_brute_force():
 def test_the_leave_one_out_likelihood_does_not_depend_on_the_blocks(monkeypatch):
     points = clusters(150, 3)
     expected = leave_one_out_log_likelihood(points, 0.3)
-    monkeypatch.setattr(potential_field, "PAIRS_PER_BLOCK", 1000)
-    monkeypatch.setattr(kernels, "PAIRS_PER_BLOCK", 1000)
+    monkeypatch.setattr(bandwidths, "PAIRS_PER_BLOCK", 1000)
     assert leave_one_out_log_likelihood(points, 0.3) == pytest.approx(expected, rel=1e-9)
 
 
@@ -321,7 +321,7 @@ def test_the_likelihood_rule_recovers_the_scale_of_clusters_that_scott_smooths_o
 
 def test_the_likelihood_rule_on_a_subset_is_carried_over_to_all_points():
     points = torch.randn(2000, 2)
-    of_a_subset = kernels._most_likely_bandwidth(points, 0.01, 3.0, n_points=300)
+    of_a_subset = bandwidths._most_likely_bandwidth(points, 0.01, 3.0, n_points=300)
     assert of_a_subset == pytest.approx(select_bandwidth(points, "likelihood"), rel=0.2)
 
 
@@ -451,10 +451,10 @@ def test_the_blocks_do_not_change_the_result(monkeypatch):
         field = fit(points, bandwidth=0.3, threshold_quantile=0.3)
         offsets, log_sums = KernelSums(points, 0.3)._from_differences(a)
         likelihood = leave_one_out_log_likelihood(points, 0.3)
-        return offsets, log_sums, field._offset_to_safe_anchor(a), torch.tensor(likelihood)
+        return offsets, log_sums, offsets_to_nearest(a, field._safe_anchors, 0.3), torch.tensor(likelihood)
 
     expected = results()
-    for module in (potential_field, kernels, kernel_sums):
+    for module in (kernels, bandwidths, kernel_sums):
         monkeypatch.setattr(module, "PAIRS_PER_BLOCK", 1000)
     for result, wanted in zip(results(), expected, strict=True):
         torch.testing.assert_close(result, wanted, rtol=1e-5, atol=1e-5)

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from lerobot_pf2mp.results.rate import Rate
-from lerobot_pf2mp.results.rows import SummaryRow, group_cells, read_rows
+from lerobot_pf2mp.results.rows import SummaryRow, read_rows
+from lerobot_pf2mp.results.summary import group_cells
 from lerobot_pf2mp.results.tables import make_latex, make_markdown
 
 ROOT = Path(__file__).parents[1]

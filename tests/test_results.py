@@ -9,16 +9,8 @@ import pytest
 from result_rows import EPISODE, SUMMARY, UNGUIDED, cell, episodes
 
 from lerobot_pf2mp.results.rate import Rate
-from lerobot_pf2mp.results.rows import (
-    Cell,
-    EpisodeRow,
-    SummaryRow,
-    format_row,
-    group_cells,
-    read_rows,
-    summarise,
-    write_rows,
-)
+from lerobot_pf2mp.results.rows import EpisodeRow, SummaryRow, format_row, read_rows, write_rows
+from lerobot_pf2mp.results.summary import Cell, group_cells, summarise
 from lerobot_pf2mp.results.tables import make_latex, make_markdown
 
 # Rates

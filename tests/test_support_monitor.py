@@ -11,7 +11,8 @@ from torch import Tensor
 
 from lerobot_pf2mp import DPPFConfig, PF2MPConfig
 from lerobot_pf2mp.policies.dppf.modeling_dppf import DPPFPolicy
-from lerobot_pf2mp.policies.guided.potential_field_step import POTENTIAL_FIELD, DemonstratedActions
+from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
+from lerobot_pf2mp.policies.guided.potential_field_step import POTENTIAL_FIELD
 from lerobot_pf2mp.policies.guided.support_monitor import SupportMonitor
 from lerobot_pf2mp.policies.pf2mp.modeling_pf2mp import PF2MPPolicy
 from lerobot_pf2mp.potential_field import PotentialField, fit

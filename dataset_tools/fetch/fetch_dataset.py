@@ -9,7 +9,6 @@ from lerobot_pf2mp.dataset_tools.writing.episodes import PICTURES
 from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, picture_feature
 
 FPS = 25
-FETCH_OF_TASK = {"fetch_reach": "reach", "fetch_push": "push"}
 TASK_DESCRIPTIONS = {
     "reach": "Move the gripper to the red goal without touching the wall.",
     "push": "Push the block to the red goal without touching the wall.",

@@ -10,8 +10,6 @@ from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, pict
 from lerobot_pf2mp.envs.handwriting.panda import JOINT_NAMES
 from lerobot_pf2mp.envs.handwriting.sheet import HANDWRITING_FPS
 
-SPACE_OF_TASK = {"handwriting_joint": "joint", "handwriting_pen": "pen"}
-
 _NAMES = {"joint": list(JOINT_NAMES), "pen": ["x", "y"]}
 _MEANING = {
     "joint": "positions of the seven joints [rad] and the two fingers [m]",

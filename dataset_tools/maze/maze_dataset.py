@@ -16,10 +16,10 @@ from lerobot_pf2mp.dataset_tools.writing.write_trajectories import write_traject
 from lerobot_pf2mp.envs.maze.maze_image import MazePicture
 from lerobot_pf2mp.envs.maze.point_maze import BALL_RADIUS, make_point_maze
 from lerobot_pf2mp.envs.maze.swept_ball import SweptBall
+from lerobot_pf2mp.envs.tasks import MAZE_OF_TASK
 
 FPS = 10
 TASK_DESCRIPTION = "Move the ball to the red goal without touching a wall."
-MAZE_OF_TASK = {"maze_umaze": "umaze", "maze_medium": "medium", "maze_large": "large"}
 
 _FEATURES = {
     "observation.state": {"dtype": "float32", "shape": (2,), "names": ["x", "y"]},

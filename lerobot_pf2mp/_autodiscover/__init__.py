@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What LeRobot imports when it finds the distribution ``lerobot_policy_pf2mp``."""
+"""What LeRobot imports, as ``lerobot_policy_pf2mp``, when it finds the distribution of that name; and the registration."""
 
-import lerobot_pf2mp  # noqa: F401
+# Importing any part of lerobot_pf2mp registers it.
+from lerobot_pf2mp._autodiscover import registration  # noqa: F401

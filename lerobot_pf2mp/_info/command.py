@@ -6,7 +6,9 @@ from __future__ import annotations
 import math
 import sys
 from dataclasses import dataclass
+from importlib.metadata import version
 
+from .probes import DISTRIBUTION
 from .report import as_json, as_text, gather, is_well
 
 
@@ -30,6 +32,9 @@ class InfoConfig:
 
 def main() -> None:
     """The entry point."""
+    if sys.argv[1:] == ["--version"]:
+        print(f"pf2mp-info {version(DISTRIBUTION)}")
+        return
     config = _parsed()
     try:
         lines = gather(config.time_limit)

@@ -25,15 +25,8 @@ from lerobot_pf2mp.benchmark.spec import NONE, BenchmarkSpec, Job
 from lerobot_pf2mp.loading import load_config
 from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
 from lerobot_pf2mp.process.atomic_files import file_written_beside
-from lerobot_pf2mp.results.rows import (
-    EpisodeRow,
-    SummaryRow,
-    format_row,
-    group_cells,
-    read_rows,
-    summarise,
-    write_rows,
-)
+from lerobot_pf2mp.results.rows import EpisodeRow, SummaryRow, format_row, read_rows, write_rows
+from lerobot_pf2mp.results.summary import group_cells, summarise
 from lerobot_pf2mp.results.tables import make_latex, make_markdown
 
 # What a guided policy is called when guidance is off.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_pf2mp.envs.configs import PF2MPMazeEnv
+from lerobot_pf2mp.envs.configs.maze import PF2MPMazeEnv
 
 if TYPE_CHECKING:
     from lerobot_pf2mp.benchmark.spec import BenchmarkSpec

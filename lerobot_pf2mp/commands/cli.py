@@ -72,6 +72,6 @@ def plot() -> None:
 
 def train() -> None:
     """The command pf2mp-train: lerobot-train with low-dimensional datasets kept in memory."""
-    from lerobot_pf2mp.training.train import main
+    from lerobot_pf2mp.commands.train import main
 
     main()

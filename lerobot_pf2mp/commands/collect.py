@@ -11,8 +11,15 @@ from lerobot_pf2mp.commands.command import write_and_report
 from lerobot_pf2mp.commands.publishing import published_if_asked
 from lerobot_pf2mp.commands.scene import SceneConfig
 from lerobot_pf2mp.commands.writing import WritingConfig
-from lerobot_pf2mp.envs.configs import OBS_TYPES
-from lerobot_pf2mp.envs.handwriting.sheet import HANDWRITING_STEPS
+from lerobot_pf2mp.envs.tasks import (
+    FETCH_OF_TASK,
+    FETCH_STEPS,
+    HANDWRITING_STEPS,
+    MAZE_OF_TASK,
+    MAZE_STEPS,
+    OBS_TYPES,
+    SPACE_OF_TASK,
+)
 
 
 @dataclass
@@ -79,10 +86,6 @@ def main(config: CollectConfig) -> None:
 def _collect(config: CollectConfig) -> None:
     if config.obs_type not in OBS_TYPES:
         raise ValueError(f"obs_type must be one of {list(OBS_TYPES)}, got {config.obs_type!r}")
-    from lerobot_pf2mp.dataset_tools.fetch.fetch_dataset import FETCH_OF_TASK
-    from lerobot_pf2mp.dataset_tools.handwriting.handwriting_dataset import SPACE_OF_TASK
-    from lerobot_pf2mp.dataset_tools.maze.maze_dataset import MAZE_OF_TASK
-
     if config.maze_map is not None and config.task not in MAZE_OF_TASK:
         raise ValueError(f"--maze_map is for mazes only, got {config.maze_map} for {config.task}")
     if config.task in MAZE_OF_TASK:
@@ -114,7 +117,7 @@ def _collect_maze(config: CollectConfig) -> None:
         picture_width=_picture_width(config),
         seed=config.seed,
     )
-    write_and_report(config, "maze" if config.maze_map else config.task, 80, write)
+    write_and_report(config, "maze" if config.maze_map else config.task, MAZE_STEPS, write)
 
 
 def _collect_fetch(config: CollectConfig, task: str) -> None:
@@ -131,7 +134,7 @@ def _collect_fetch(config: CollectConfig, task: str) -> None:
         n_processes=config.n_processes,
         expert=None if config.expert == "scripted" else Path(config.expert).expanduser(),
     )
-    write_and_report(config, config.task, 48, write)
+    write_and_report(config, config.task, FETCH_STEPS, write)
 
 
 def _collect_handwriting(config: CollectConfig, space: str) -> None:

@@ -12,11 +12,26 @@ from typing import Any, Protocol
 
 import draccus
 
+from lerobot_pf2mp import __version__
 from lerobot_pf2mp.process.interruption import exit_code, sigterm_like_ctrl_c
+
+# Options under earlier names, which go on working.
+_RENAMED = {"--picture_width": "--image_width"}
+
+
+def answer_version() -> None:
+    """Prints the version and ends the process if the command line is ``--version``, before anything large is imported."""
+    if sys.argv[1:] == ["--version"]:
+        print(f"{Path(sys.argv[0]).name} {__version__}")
+        sys.exit()
 
 
 def run(config_class: type, main: Callable[[Any], None]) -> None:
     """Parses the command line and runs a command; whatever a user can cause ends in one line and a non-zero code."""
+    answer_version()
+    for number, argument in enumerate(sys.argv):
+        name, equals, value = argument.partition("=")
+        sys.argv[number] = f"{_RENAMED.get(name, name)}{equals}{value}"
     # LeRobot's lengthy warning about a video decoder that these commands do not use.
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
     try:

@@ -11,7 +11,7 @@ from lerobot_pf2mp.commands.command import write_and_report
 from lerobot_pf2mp.commands.publishing import published_if_asked
 from lerobot_pf2mp.commands.scene import SceneConfig
 from lerobot_pf2mp.commands.writing import WritingConfig
-from lerobot_pf2mp.envs.handwriting.sheet import HANDWRITING_STEPS
+from lerobot_pf2mp.envs.tasks import FETCH_OF_TASK, FETCH_STEPS, HANDWRITING_STEPS, MAZE_STEPS, SPACE_OF_TASK
 
 
 @dataclass
@@ -102,17 +102,15 @@ def _convert(config: ConvertConfig) -> None:
 
 
 def _convert_maze(config: ConvertConfig, path: Path) -> None:
-    from lerobot_pf2mp.dataset_tools.fetch.fetch_dataset import FETCH_OF_TASK
-    from lerobot_pf2mp.dataset_tools.handwriting.handwriting_dataset import SPACE_OF_TASK
-    from lerobot_pf2mp.dataset_tools.maze.convert_d4rl import read_d4rl
-    from lerobot_pf2mp.dataset_tools.maze.convert_minari import read_minari
-    from lerobot_pf2mp.dataset_tools.maze.maze_dataset import maze_of, write_maze_dataset
-
     for tasks, source_type in ((FETCH_OF_TASK, "fetch"), (SPACE_OF_TASK, "handwriting")):
         if config.task in tasks:
             raise ValueError(
                 f"--source.type must be {source_type} for {config.task}, got {config.source.type!r}"
             )
+    from lerobot_pf2mp.dataset_tools.maze.convert_d4rl import read_d4rl
+    from lerobot_pf2mp.dataset_tools.maze.convert_minari import read_minari
+    from lerobot_pf2mp.dataset_tools.maze.maze_dataset import maze_of, write_maze_dataset
+
     maze = maze_of(config.task, config.maze_map)
     n_expected, trajectories = read_d4rl(path, maze) if config.source.type == "d4rl" else read_minari(path)
     write = partial(
@@ -123,15 +121,14 @@ def _convert_maze(config: ConvertConfig, path: Path) -> None:
         n_episodes=config.n_episodes,
         n_expected=n_expected,
     )
-    write_and_report(config, "maze" if config.maze_map else config.task, 80, write)
+    write_and_report(config, "maze" if config.maze_map else config.task, MAZE_STEPS, write)
 
 
 def _convert_fetch(config: ConvertConfig, path: Path) -> None:
-    from lerobot_pf2mp.dataset_tools.fetch.convert_fetch import convert_fetch
-    from lerobot_pf2mp.dataset_tools.fetch.fetch_dataset import FETCH_OF_TASK
-
     if config.task not in FETCH_OF_TASK:
         raise ValueError(f"task must be one of {list(FETCH_OF_TASK)}, got {config.task!r}")
+    from lerobot_pf2mp.dataset_tools.fetch.convert_fetch import convert_fetch
+
     write = partial(
         convert_fetch,
         path,
@@ -139,15 +136,14 @@ def _convert_fetch(config: ConvertConfig, path: Path) -> None:
         scene_changes=asdict(config.scene),
         n_episodes=config.n_episodes,
     )
-    write_and_report(config, config.task, 48, write)
+    write_and_report(config, config.task, FETCH_STEPS, write)
 
 
 def _convert_handwriting(config: ConvertConfig, path: Path) -> None:
-    from lerobot_pf2mp.dataset_tools.handwriting.convert_handwriting import convert_handwriting
-    from lerobot_pf2mp.dataset_tools.handwriting.handwriting_dataset import SPACE_OF_TASK
-
     if config.task not in SPACE_OF_TASK:
         raise ValueError(f"task must be one of {list(SPACE_OF_TASK)}, got {config.task!r}")
+    from lerobot_pf2mp.dataset_tools.handwriting.convert_handwriting import convert_handwriting
+
     write = partial(
         convert_handwriting,
         path,

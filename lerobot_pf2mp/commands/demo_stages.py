@@ -14,14 +14,16 @@ from pathlib import Path
 
 from lerobot_pf2mp.dataset_tools.maze.collect_maze import collect_maze
 from lerobot_pf2mp.dataset_tools.maze.maze_dataset import maze_of
-from lerobot_pf2mp.envs.configs import MAZE_TASKS, PF2MPMazeEnv
+from lerobot_pf2mp.envs.configs.maze import PF2MPMazeEnv
+from lerobot_pf2mp.envs.tasks import MAZE_STEPS, MAZE_TASKS
 from lerobot_pf2mp.figures.policy_figures import GuidedPolicyFigures
 from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
 from lerobot_pf2mp.results.rate import Rate
-from lerobot_pf2mp.results.rows import NO_GUIDANCE, EpisodeRow, SummaryRow, summarise, write_rows
+from lerobot_pf2mp.results.rows import NO_GUIDANCE, EpisodeRow, SummaryRow, write_rows
+from lerobot_pf2mp.results.summary import summarise
 
 _MODULES = {
-    "pf2mp-train": "lerobot_pf2mp.training.train",
+    "pf2mp-train": "lerobot_pf2mp.commands.train",
     "lerobot-eval": "lerobot.scripts.lerobot_eval",
 }
 DEFAULT_GUIDANCE_SCALE = PF2MPConfig.guidance_scale
@@ -72,7 +74,7 @@ def run_demo(
             root=data,
             repo_id=f"local/{task}",
             n_episodes=n_demonstrations,
-            n_steps=80,
+            n_steps=MAZE_STEPS,
             action_noise=0.0,
             seed=seed,
             overwrite=False,
@@ -144,9 +146,9 @@ def _train(task: str, data: Path, output_dir: Path, steps: int, seed: int) -> No
         "--policy.type=pf2mp",
         "--policy.push_to_hub=false",
         "--policy.device=cpu",
-        "--policy.horizon=80",
-        "--policy.n_action_steps=80",
-        "--policy.drop_n_last_frames=79",
+        f"--policy.horizon={MAZE_STEPS}",
+        f"--policy.n_action_steps={MAZE_STEPS}",
+        f"--policy.drop_n_last_frames={MAZE_STEPS - 1}",
         "--policy.down_dims=[32,64,128]",
         "--batch_size=64",
         f"--steps={steps}",
@@ -221,7 +223,10 @@ def _run(command: str, *options: str, equivalent: str | None = None, log: Path |
     sys.stdout.flush()
     with log.open("wb") if log else nullcontext() as output:
         finished = subprocess.run(
-            [sys.executable, "-m", _MODULES[command], *options], check=False, stdout=output, stderr=output
+            [sys.executable, "-P", "-m", _MODULES[command], *options],
+            check=False,
+            stdout=output,
+            stderr=output,
         )
     if finished.returncode != 0:
         where = f"see {log}" if log else "its output is above"

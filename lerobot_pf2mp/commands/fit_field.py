@@ -72,12 +72,12 @@ class FitFieldConfig:
 
 def main(config: FitFieldConfig) -> None:
     """Runs the command."""
-    from lerobot_pf2mp.fit_field import fit_field
-
     policy, dataset = config.policy, config.dataset
     path = given("--policy.path", policy.path)
     repo_id = given("--dataset.repo_id", dataset.repo_id)
     output_dir = given("--output_dir", config.output_dir)
+    from lerobot_pf2mp.fit_field import fit_field
+
     changed = {name: value for name, value in asdict(policy).items() if value is not None}
     del changed["path"]
     revision = changed.pop("revision", None)

@@ -10,7 +10,7 @@ from typing import Any
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_pf2mp.commands.command import given
-from lerobot_pf2mp.envs.configs import PF2MPMazeEnv
+from lerobot_pf2mp.envs.configs.maze import PF2MPMazeEnv
 
 
 @dataclass

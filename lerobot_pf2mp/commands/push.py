@@ -5,8 +5,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lerobot_pf2mp.commands.command import given
+
+if TYPE_CHECKING:
+    from lerobot_pf2mp.hub.model_card import PolicyFacts
 
 
 @dataclass
@@ -30,7 +34,7 @@ class PushConfig:
     private: bool | None = None
     # Folder that pf2mp-benchmark has written, for a table of results; by default the checkpoint's own "results".
     results: Path | None = None
-    # Pictures (png) and videos (mp4) for the card.
+    # Images (png) and videos (mp4) for the card.
     figures: list[Path] = field(default_factory=list)
     # Name of the dataset on the Hub; by default the one that the policy was trained on.
     dataset: str | None = None
@@ -40,11 +44,13 @@ class PushConfig:
 
 def main(config: PushConfig) -> None:
     """Runs the command."""
+    path, repo_id = given("--path", config.path).expanduser(), given("--repo_id", config.repo_id)
     from lerobot_pf2mp.hub.publish_checkpoint import publish_checkpoint
 
     url = publish_checkpoint(
-        given("--path", config.path).expanduser(),
-        given("--repo_id", config.repo_id),
+        path,
+        repo_id,
+        _loaded_facts(path),
         results=config.results and config.results.expanduser(),
         figures=[figure.expanduser() for figure in config.figures],
         dataset=config.dataset,
@@ -52,3 +58,26 @@ def main(config: PushConfig) -> None:
         branch=config.branch,
     )
     print(f"Published {config.path} at {url}.")
+
+
+def _loaded_facts(path: Path) -> PolicyFacts:
+    """What the card says of a checkpoint, which is loaded whole: a damaged one is not published.
+
+    Raises:
+        ValueError: If the checkpoint is of a policy that is not of this package, or damaged.
+        OSError: If it cannot be read.
+    """
+    from lerobot_pf2mp.hub.model_card import POLICY_NAMES
+    from lerobot_pf2mp.loading import load_config, load_policy, loaded_field
+    from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
+    from lerobot_pf2mp.policies.model_card import policy_facts
+
+    if not path.is_dir():
+        raise FileNotFoundError(f"--path must be a checkpoint's pretrained_model folder, got {path}")
+    config = load_config(path, device="cpu")
+    if config.type not in POLICY_NAMES:
+        raise ValueError(f"the checkpoint's type must be one of {list(POLICY_NAMES)}, got {config.type!r}")
+    _, preprocessor, _ = load_policy(path, device="cpu")
+    return policy_facts(
+        config, loaded_field(config, preprocessor) if isinstance(config, GuidedConfig) else None
+    )

@@ -9,6 +9,7 @@ from typing import Any
 
 from lerobot_pf2mp.commands.command import given
 from lerobot_pf2mp.commands.scene import SceneConfig
+from lerobot_pf2mp.envs.tasks import FETCH_OF_TASK
 
 
 @dataclass
@@ -53,12 +54,11 @@ class TrainExpertConfig:
 
 def main(config: TrainExpertConfig) -> None:
     """Runs the command."""
-    from lerobot_pf2mp.dataset_tools.experts.train_expert import train_expert
-    from lerobot_pf2mp.dataset_tools.fetch.fetch_dataset import FETCH_OF_TASK
-
     if config.task not in FETCH_OF_TASK:
         raise ValueError(f"task must be one of {list(FETCH_OF_TASK)}, got {config.task!r}")
     output_dir = given("--output_dir", config.output_dir).expanduser()
+    from lerobot_pf2mp.dataset_tools.experts.train_expert import train_expert
+
     expert = train_expert(
         FETCH_OF_TASK[config.task],
         config.algo,

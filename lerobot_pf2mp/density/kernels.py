@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gaussian kernels: their exponents, their sums, and how wide they should be."""
+"""Gaussian kernels: their exponents and their sums."""
 
 from __future__ import annotations
 
@@ -8,102 +8,11 @@ import math
 import torch
 from torch import Tensor
 
-BANDWIDTH_RULES = ("scott", "silverman", "likelihood")
-
 # Pairs (query, anchor) held at once: 2^20 float32 numbers, 4 MB, stay in a core's cache.
 PAIRS_PER_BLOCK = 2**20
 
 # The root of float32's largest number, with room for a sum of a thousand squares.
 _LARGEST = 5e17
-
-# Relative to the spread of the points. Below it a float32 kernel resolves nothing but duplicates.
-_SMALLEST_BANDWIDTH = 1e-3
-
-
-def select_bandwidth(points: Tensor, rule: float | str = "likelihood") -> float:
-    """The kernel bandwidth h for a set of points.
-
-    Args:
-        points: ``(M, D)`` points [normalised].
-        rule: ``scott`` (M^(-1/(D+4)) times the points' standard deviation), ``silverman`` (the same times
-            (4/(D+2))^(1/(D+4))), ``likelihood`` (maximises the leave-one-out log likelihood), or h itself. The kernel
-            is isotropic, so the standard deviation is the root mean square over the dimensions that vary.
-
-    Returns:
-        The bandwidth h > 0 [normalised].
-
-    Raises:
-        ValueError: If the rule is unknown, or a number that is not finite and positive.
-    """
-    if isinstance(rule, (int, float)) and not isinstance(rule, bool):
-        check_bandwidth(rule)
-        return float(rule)
-    if rule not in BANDWIDTH_RULES:
-        raise ValueError(f"bandwidth must be one of {BANDWIDTH_RULES} or a positive number, got {rule!r}")
-    variance = points.cpu().double().var(dim=0, correction=0)  # (D,)
-    varying = variance > 0
-    if not bool(varying.any()):
-        return _SMALLEST_BANDWIDTH  # all points are the same one: there is no spread to measure
-    spread = variance[varying].mean().sqrt().item()
-    count, dim = len(points), int(varying.sum())
-    scott = spread * count ** (-1 / (dim + 4))
-    if rule == "scott":
-        return scott
-    if rule == "silverman":
-        return scott * (4 / (dim + 2)) ** (1 / (dim + 4))
-    return _most_likely_bandwidth(
-        points.cpu()[:, varying], smallest=_SMALLEST_BANDWIDTH * spread, largest=3 * spread
-    )
-
-
-def leave_one_out_log_likelihood(points: Tensor, bandwidth: float) -> float:
-    """The mean of log p_{-i}(x_i) over the points, p_{-i} being the density fitted without point i.
-
-    Args:
-        points: ``(M, D)`` distinct points, M >= 2.
-        bandwidth: The kernel bandwidth h > 0.
-
-    Returns:
-        The mean leave-one-out log likelihood [nats].
-    """
-    count, dim = points.shape
-    centred = points.float() - mean(points)
-    rows_per_block = max(1, PAIRS_PER_BLOCK // count)
-    total = 0.0
-    for start in range(0, count, rows_per_block):
-        exponents = log_kernels(centred[start : start + rows_per_block], centred, bandwidth)
-        exponents.diagonal(offset=start).fill_(-math.inf)
-        total += log_sum_exp(exponents).cpu().double().sum().item()
-    log_normaliser = math.log(count - 1) + dim * (math.log(bandwidth) + 0.5 * math.log(2 * math.pi))
-    return total / count - log_normaliser
-
-
-@torch.no_grad()
-def _most_likely_bandwidth(points: Tensor, smallest: float, largest: float, n_points: int = 3000) -> float:
-    """The bandwidth of largest leave-one-out likelihood, to 1 %, by golden-section search on log h.
-
-    Duplicated points are dropped first: with them the likelihood is unbounded as h tends to 0. For more than
-    `n_points` points an even subset is used, and the h found is carried over by Scott's power of the count.
-    """
-    distinct = torch.unique(points.float(), dim=0)
-    if len(distinct) < 2:
-        return smallest
-    subset = distinct[torch.linspace(0, len(distinct) - 1, min(n_points, len(distinct))).long()]
-    golden = (math.sqrt(5) - 1) / 2
-    low, high = math.log(smallest), math.log(largest)
-    left, right = high - golden * (high - low), low + golden * (high - low)
-    at_left = leave_one_out_log_likelihood(subset, math.exp(left))
-    at_right = leave_one_out_log_likelihood(subset, math.exp(right))
-    while high - low > 0.01:
-        if at_left > at_right:
-            high, right, at_right = right, left, at_left
-            left = high - golden * (high - low)
-            at_left = leave_one_out_log_likelihood(subset, math.exp(left))
-        else:
-            low, left, at_left = left, right, at_right
-            right = low + golden * (high - low)
-            at_right = leave_one_out_log_likelihood(subset, math.exp(right))
-    return math.exp((low + high) / 2) * (len(subset) / len(distinct)) ** (1 / (points.shape[1] + 4))
 
 
 def log_kernels(queries: Tensor, anchors: Tensor, bandwidth: float) -> Tensor:
@@ -124,6 +33,19 @@ def log_kernels(queries: Tensor, anchors: Tensor, bandwidth: float) -> Tensor:
         return squares.neg_()
 
 
+def offsets_to_nearest(queries: Tensor, anchors: Tensor, bandwidth: float) -> Tensor:
+    """The offsets ``(Q, D)`` from queries ``(Q, D)`` to their nearest anchors, of ``(M, D)``, in blocks of pairs."""
+    # Float32 resolves differences between points, not their common offset.
+    centre = anchors[0]
+    centred = anchors - centre
+    return torch.cat(
+        [
+            centred[log_kernels(block, centred, bandwidth).argmax(dim=-1)] - block
+            for block in (queries - centre).split(max(1, PAIRS_PER_BLOCK // len(anchors)))
+        ]
+    )
+
+
 def mean(points: Tensor) -> Tensor:
     """The mean ``(D,)`` of points ``(M, D)`` in double precision, which not every device has, as float32."""
     return points.cpu().double().mean(dim=0).float().to(points.device)
@@ -137,9 +59,3 @@ def log_sum_exp(exponents: Tensor) -> Tensor:
     """
     largest_weight = torch.softmax(exponents, dim=-1).amax(dim=-1)
     return exponents.amax(dim=-1) - largest_weight.log()
-
-
-def check_bandwidth(bandwidth: float) -> None:
-    """Raises a ValueError unless the bandwidth is finite and positive."""
-    if not (bandwidth > 0 and math.isfinite(bandwidth)):
-        raise ValueError(f"bandwidth must be finite and positive, got {bandwidth}")

@@ -21,14 +21,18 @@ from torch import Tensor
 
 from lerobot_pf2mp import figures
 from lerobot_pf2mp.benchmark.prior_noise import seeded_prior_noise
-from lerobot_pf2mp.envs.configs import MAZE_TASKS, PF2MPFetchEnv, PF2MPHandwritingEnv, PF2MPMazeEnv
+from lerobot_pf2mp.envs.configs.fetch import PF2MPFetchEnv
+from lerobot_pf2mp.envs.configs.handwriting import PF2MPHandwritingEnv
+from lerobot_pf2mp.envs.configs.maze import PF2MPMazeEnv
 from lerobot_pf2mp.envs.maze.point_maze import parse_maze_map
+from lerobot_pf2mp.envs.tasks import MAZE_TASKS
 from lerobot_pf2mp.figures import Path2D, PathPair, Scene
 from lerobot_pf2mp.figures.comparison_video import write_comparison
 from lerobot_pf2mp.loading import load_policy
 from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
 from lerobot_pf2mp.policies.guided.potential_field_step import POTENTIAL_FIELD
-from lerobot_pf2mp.results.rows import SummaryRow, group_cells, read_rows
+from lerobot_pf2mp.results.rows import SummaryRow, read_rows
+from lerobot_pf2mp.results.summary import group_cells
 
 FIGURES = ("lambda", "density", "arrows", "trajectories", "overview", "strokes", "flow", "video")
 
@@ -194,7 +198,7 @@ class GuidedPolicyFigures:
         shape = (n_chunks, self._config.horizon, self._config.action_feature.shape[0])
         noise = torch.randn(shape, generator=torch.Generator().manual_seed(self._seed))
         traces = []
-        for guide in (None, self._policy.make_guide(batch)):
+        for guide in (None, self._policy.guidance.guide(batch, noise.device)):
             trace = _Trace(guide)
             self._policy.reset()
             self._policy.predict_action_chunk(batch, noise=noise, guide=trace)

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lerobot_pf2mp.figures.theme import EULER, GUIDED, THEMES, WIDTH, Theme, themed_figure
-from lerobot_pf2mp.results.rows import NO_GUIDANCE, Cell
+from lerobot_pf2mp.results.rows import NO_GUIDANCE
+from lerobot_pf2mp.results.summary import Cell
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

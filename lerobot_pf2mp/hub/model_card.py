@@ -6,23 +6,16 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import PurePosixPath
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import draccus
 from huggingface_hub import ModelCard, ModelCardData
 
-from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
-
-if TYPE_CHECKING:
-    from lerobot.configs import PreTrainedConfig
-
-    from lerobot_pf2mp.potential_field import PotentialField
-
 INSTALL = "pip install lerobot_policy_pf2mp"
+DEFAULT_LICENSE = "apache-2.0"
 
 _TAGS = {"fmp": ["flow-matching"], "pf2mp": ["flow-matching"], "dppf": ["diffusion"]}
 POLICY_NAMES = {
@@ -36,7 +29,7 @@ _GENERATES = {
     "dppf": "It is LeRobot's Diffusion Policy, whose denoising turns noise into a chunk of actions.",
 }
 _GUIDED = (
-    "On the way a potential field, fitted to the demonstrated actions alone, steers every action back to where the "
+    "While it does so, a potential field, fitted to the demonstrated actions alone, steers every action back to where the "
     "demonstrations went, and so away from obstacles that nobody has modelled. The field is part of this repository and "
     "comes with the preprocessor; `--policy.guidance_scale=0` turns it off. The method is *Towards Safe Imitation Learning "
     "via Potential Field-Guided Flow Matching* (Ding et al., IROS 2025, [arXiv:2508.08707]"
@@ -45,90 +38,103 @@ _GUIDED = (
 _LIMITS = (
     "Obstacles must be where they were in the demonstrations, and demonstrations must cover the free space that is needed: "
     "what was never visited counts as unsafe.",
-    "The field sees single actions, not the way from one to the next.",
+    "The field sees single actions, not the path from one to the next.",
     "It is guidance, not a guarantee: collisions become rare, not impossible. Do not rely on it where people could be hurt.",
 )
 _UNGUIDED_LIMITS = ("It imitates the demonstrations and knows nothing of obstacles or of limits of a robot.",)
 
 
 @dataclass(frozen=True)
-class CardFacts:
-    """What a card is made from.
+class GuidanceFacts:
+    """What a card says of a policy's guidance.
 
     Args:
-        config: The policy's configuration.
-        repo_id: Where it is published, ``user/name``.
+        scale: lambda.
+        integrator: proximal or euler.
+        point: The point at which the field is asked; None for the integrator's own.
+        action_dims: The action dimensions that the field covers; None for all.
+        alpha: Weight of the distance term [1/normalised].
+        bandwidth_rule: The rule by which the bandwidth was chosen; None for a given number.
+        bandwidth: The bandwidth h [normalised action units]; None if the field is not fitted.
+        n_anchors: The number M of anchors; None if the field is not fitted.
+    """
+
+    scale: float
+    integrator: str
+    point: str | None
+    action_dims: Sequence[int] | None
+    alpha: float
+    bandwidth_rule: str | None
+    bandwidth: float | None = None
+    n_anchors: int | None = None
+
+
+@dataclass(frozen=True)
+class PolicyFacts:
+    """What a card says of a policy.
+
+    Args:
+        type: Its registered name, one of `POLICY_NAMES`.
+        inputs: Shapes of the input features by name.
+        outputs: Shapes of the output features by name.
+        horizon: Actions predicted at once.
+        n_action_steps: Actions executed of them.
+        num_inference_steps: Integration or denoising steps N.
+        guidance: Its guidance; None for an unguided policy.
+        license: Name of the licence; None for the default.
+        tags: Further tags.
+    """
+
+    type: str
+    inputs: Mapping[str, Sequence[int]]
+    outputs: Mapping[str, Sequence[int]]
+    horizon: int
+    n_action_steps: int
+    num_inference_steps: int
+    guidance: GuidanceFacts | None = None
+    license: str | None = None
+    tags: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class CardFacts:
+    """All facts that a card is written from.
+
+    Args:
+        policy: The policy.
+        repo_id: The repository in which it is published, ``user/name``.
         dataset: Name of the dataset it was trained on; None if unknown.
         dataset_size: Its number of episodes and of frames; None if unknown.
         training: LeRobot's training configuration, as in ``train_config.json``; empty if unknown.
         env_options: Options of lerobot-eval for the environment, as `env_options` gives them; empty if unknown.
-        potential_field: What guides it; None without one.
         table: A table of results in Markdown; None without one.
         made_with: Versions and hardware of the results.
-        figures: Pictures and videos, by their paths in the repository.
-        license: Name of the licence.
-        tags: Further tags.
+        figures: Images and videos, by their paths in the repository.
     """
 
-    config: PreTrainedConfig
+    policy: PolicyFacts
     repo_id: str
     dataset: str | None = None
     dataset_size: tuple[int, int] | None = None
     training: Mapping[str, Any] = field(default_factory=dict)
     env_options: Sequence[str] = ()
-    potential_field: PotentialField | None = None
     table: str | None = None
     made_with: Mapping[str, str] = field(default_factory=dict)
     figures: Sequence[str] = ()
-    license: str = "apache-2.0"
-    tags: Sequence[str] = ()
-
-
-class WithModelCard:
-    """A policy that is published with a card of this package, to be mixed into LeRobot's policies before their own class.
-
-    LeRobot 0.6 asks the policy for its card. Should a later one not ask, its own card is published.
-    """
-
-    def generate_model_card(
-        self,
-        dataset_repo_id: str | None,
-        model_type: str,
-        license: str | None = None,
-        tags: Sequence[str] | None = None,
-        cfg: Any = None,
-        dataset_meta: Any = None,
-        **_: Any,
-    ) -> ModelCard:
-        """The card; the arguments are those of LeRobot's `PreTrainedPolicy.generate_model_card`."""
-        config: Any = self.config  # type: ignore[attr-defined]
-        training = {} if cfg is None else cfg.to_dict()
-        facts = CardFacts(
-            config=config,
-            repo_id=config.repo_id or f"you/your_{model_type}",
-            dataset=dataset_repo_id,
-            dataset_size=dataset_meta and (dataset_meta.total_episodes, dataset_meta.total_frames),
-            training=training,
-            env_options=env_options(training.get("env")),
-            potential_field=_field_of(self, config),
-            license=license or "apache-2.0",
-            tags=tuple(tags or ()),
-        )
-        return make_model_card(facts)
 
 
 def make_model_card(facts: CardFacts) -> ModelCard:
     """The card of a policy of this package."""
-    kind = facts.config.type
-    tags = ["lerobot", "pf2mp", *_TAGS[kind], "robotics", kind, *facts.tags]
+    kind, license = facts.policy.type, facts.policy.license or DEFAULT_LICENSE
+    is_guided = facts.policy.guidance is not None
+    tags = ["lerobot", "pf2mp", *_TAGS[kind], "robotics", kind, *facts.policy.tags]
     metadata = ModelCardData(
         library_name="lerobot",
         pipeline_tag="robotics",
-        license=facts.license,
+        license=license,
         tags=list(dict.fromkeys(tags)),
         datasets=[str(facts.dataset)] if _is_on_the_hub(facts.dataset) else None,
     )
-    is_guided = isinstance(facts.config, GuidedConfig)
     sections = [
         f"# {facts.repo_id}",
         f"A {POLICY_NAMES[kind]} for [LeRobot](https://github.com/huggingface/lerobot). {_GENERATES[kind]}"
@@ -141,7 +147,7 @@ def make_model_card(facts: CardFacts) -> ModelCard:
         "## Limits",
         "\n".join(f"- {limit}" for limit in (_LIMITS if is_guided else _UNGUIDED_LIMITS)),
         "## Licence",
-        facts.license,
+        license,
     ]
     return ModelCard(f"---\n{metadata.to_yaml()}\n---\n\n" + "\n\n".join(sections) + "\n")
 
@@ -168,14 +174,6 @@ def env_options(env: Mapping[str, Any] | None) -> list[str]:
     return options
 
 
-def _field_of(policy: object, config: Any) -> PotentialField | None:
-    """The field of the actions that a policy was just trained on; None if it has none."""
-    demonstrations = getattr(getattr(policy, "_guidance", None), "demonstrations", None)
-    with suppress(ValueError):  # not fitted, as in a training of no steps
-        return demonstrations and demonstrations.field(config.field_settings)
-    return None
-
-
 def _is_on_the_hub(dataset: str | None) -> bool:
     """Whether a dataset's name can be one of the Hub's; those of this package's commands are local/... by default."""
     return bool(dataset and dataset.count("/") == 1 and not dataset.startswith("local/"))
@@ -184,7 +182,7 @@ def _is_on_the_hub(dataset: str | None) -> bool:
 def _usage(facts: CardFacts) -> str:
     dataset = facts.dataset if _is_on_the_hub(facts.dataset) else "you/your_dataset"
     env = " ".join(facts.env_options or ("--env.type=ENVIRONMENT", "--env.task=TASK"))
-    kind = facts.config.type
+    kind = facts.policy.type
     commands = f"""\
 ```bash
 {INSTALL}
@@ -219,19 +217,15 @@ action = postprocess(policy.select_action(preprocess(observation)))
 
 
 def _details(facts: CardFacts) -> list[tuple[str, str]]:
-    config: Any = facts.config
+    policy = facts.policy
     rows = [("dataset", _describe_dataset(facts))]
-    for name, features in (("inputs", config.input_features), ("outputs", config.output_features)):
+    for name, features in (("inputs", policy.inputs), ("outputs", policy.outputs)):
         if features:
-            rows.append((name, ", ".join(f"`{key}` {tuple(ft.shape)}" for key, ft in features.items())))
-    rows.append(("chunk", f"{config.horizon} actions, of which {config.n_action_steps} are executed"))
-    rows.append(("steps N", str(config.num_inference_steps or config.num_train_timesteps)))
-    if isinstance(config, GuidedConfig):
-        point = f", field asked at: {config.guidance_point}" if config.guidance_point else ""
-        rows.append(("guidance strength lambda", f"{config.guidance_scale:g}"))
-        rows.append(("guidance integrator", f"{config.guidance_integrator}{point}"))
-    if facts.potential_field is not None:
-        rows += _describe_field(facts.potential_field, config)
+            rows.append((name, ", ".join(f"`{key}` {tuple(shape)}" for key, shape in features.items())))
+    rows.append(("chunk", f"{policy.horizon} actions, of which {policy.n_action_steps} are executed"))
+    rows.append(("steps N", str(policy.num_inference_steps)))
+    if policy.guidance is not None:
+        rows += _describe_guidance(policy.guidance)
     words = {"steps": "steps: {}", "batch_size": "batch size: {}", "seed": "seed: {}"}
     known = {key: facts.training.get(key) for key in words}
     if any(value is not None for value in known.values()):
@@ -254,15 +248,22 @@ def _describe_dataset(facts: CardFacts) -> str:
     return f"{name}: {n_episodes} episodes, {n_frames} frames"
 
 
-def _describe_field(potential_field: PotentialField, config: GuidedConfig) -> list[tuple[str, str]]:
-    dims = config.field_action_dims
-    covered = f"all {potential_field.dim}" if dims is None else ", ".join(map(str, dims))
-    rule = f", by the rule {config.field_bandwidth}" if isinstance(config.field_bandwidth, str) else ""
+def _describe_guidance(guidance: GuidanceFacts) -> list[tuple[str, str]]:
+    point = f", field asked at: {guidance.point}" if guidance.point else ""
+    rows = [
+        ("guidance strength lambda", f"{guidance.scale:g}"),
+        ("guidance integrator", f"{guidance.integrator}{point}"),
+    ]
+    if guidance.bandwidth is None:
+        return rows
+    rule = f", by the rule {guidance.bandwidth_rule}" if guidance.bandwidth_rule else ""
+    dims = guidance.action_dims
     return [
-        ("bandwidth h", f"{potential_field.bandwidth:.4g} [normalised action units]{rule}"),
-        ("anchors M", f"{len(potential_field.anchors)} demonstrated actions"),
-        ("action dimensions of the field", covered),
-        ("distance term alpha", f"{config.field_alpha:g}"),
+        *rows,
+        ("bandwidth h", f"{guidance.bandwidth:.4g} [normalised action units]{rule}"),
+        ("anchors M", f"{guidance.n_anchors} demonstrated actions"),
+        ("action dimensions of the field", "all" if dims is None else ", ".join(map(str, dims))),
+        ("distance term alpha", f"{guidance.alpha:g}"),
     ]
 
 
@@ -285,7 +286,7 @@ def _results(facts: CardFacts) -> list[str]:
 
 
 def _show(figure: str, repo_id: str) -> str:
-    """A picture, or a video, for which the Hub wants a full address."""
+    """An image, or a video, for which the Hub wants a full address."""
     path = PurePosixPath(figure)
     if path.suffix == ".mp4":
         return f'<video controls src="https://huggingface.co/{repo_id}/resolve/main/{figure}"></video>'

@@ -9,10 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lerobot_pf2mp.hub.model_card import POLICY_NAMES, CardFacts, env_options, make_model_card
+from lerobot_pf2mp.hub.model_card import CardFacts, PolicyFacts, env_options, make_model_card
 from lerobot_pf2mp.hub.publishing import check_destination, publish
-from lerobot_pf2mp.loading import load_config, load_policy, loaded_field
-from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
 from lerobot_pf2mp.results.rows import SummaryRow, read_rows
 
 _SUFFIXES = {".safetensors", ".json", ".yaml"}
@@ -32,6 +30,7 @@ class _Results:
 def publish_checkpoint(
     path: Path,
     repo_id: str,
+    policy: PolicyFacts,
     *,
     results: Path | None = None,
     figures: Sequence[Path] = (),
@@ -39,14 +38,15 @@ def publish_checkpoint(
     private: bool | None = None,
     branch: str | None = None,
 ) -> str:
-    """Publishes a policy of this package with its processors, field, card, results and figures, in one commit.
+    """Publishes a policy with its processors, field, card, results and figures, in one commit.
 
     Args:
         path: The checkpoint's ``pretrained_model`` folder.
         repo_id: The repository, ``user/name``.
+        policy: What the card says of the policy.
         results: A folder that `run_benchmark` has written; None for ``results`` in the checkpoint, if it is there.
-        figures: Pictures and videos for the card.
-        dataset: Name of the dataset on the Hub; None for the one that the training was told.
+        figures: Images and videos for the card.
+        dataset: Name of the dataset on the Hub; None for the one named in the checkpoint's training configuration.
         private: Whether a new repository is private; None for the Hub's default.
         branch: Branch, which is made if there is none; None for main.
 
@@ -54,17 +54,9 @@ def publish_checkpoint(
         The repository's address.
 
     Raises:
-        ValueError: If the checkpoint is of another policy or damaged, or an argument breaks its rule.
+        ValueError: If an argument breaks its rule.
         OSError: If a file cannot be read, or the Hub cannot be reached or refuses.
     """
-    if not path.is_dir():
-        raise FileNotFoundError(f"--path must be a checkpoint's pretrained_model folder, got {path}")
-    config = load_config(path, device="cpu")
-    if config.type not in POLICY_NAMES:
-        raise ValueError(f"the checkpoint's type must be one of {list(POLICY_NAMES)}, got {config.type!r}")
-    _, preprocessor, _ = load_policy(path, device="cpu")
-    potential_field = loaded_field(config, preprocessor) if isinstance(config, GuidedConfig) else None
-
     files: dict[str, Path | bytes] = {
         file.name: file
         for file in sorted(path.iterdir())
@@ -76,31 +68,28 @@ def publish_checkpoint(
     if results is not None:
         files.update({f"results/{name}": results / name for name in _RESULTS_FILES})
     for figure in figures:
-        place = f"figures/{figure.name}"
+        path_in_repo = f"figures/{figure.name}"
         if figure.suffix not in _FIGURE_SUFFIXES or not figure.is_file():
             raise ValueError(f"--figures must be files ending in {_FIGURE_SUFFIXES}, got {figure}")
-        if place in files:
+        if path_in_repo in files:
             raise ValueError(f"--figures must have names of their own, got {figure.name} twice")
-        files[place] = figure
+        files[path_in_repo] = figure
 
     training = _read_training(path)
     card = make_model_card(
         CardFacts(
-            config=config,
+            policy=policy,
             repo_id=check_destination(repo_id),
             dataset=dataset or training.get("dataset", {}).get("repo_id"),
             training=training,
             env_options=env_options(training.get("env")) or (found.env_options if found else ()),
-            potential_field=potential_field,
             table=found.table if found else None,
             made_with=found.made_with if found else {},
-            figures=[place for place in files if place.startswith("figures/")],
-            license=config.license or "apache-2.0",
-            tags=tuple(config.tags or ()),
+            figures=[name for name in files if name.startswith("figures/")],
         )
     )
     files["README.md"] = str(card).encode()
-    message = f"Upload {config.type} policy with processors and card"
+    message = f"Upload {policy.type} policy with processors and card"
     return publish(repo_id, "model", files, message=message, private=private, branch=branch)
 
 

@@ -7,7 +7,8 @@ import re
 from collections.abc import Sequence
 
 from lerobot_pf2mp.results.rate import Rate
-from lerobot_pf2mp.results.rows import NO_GUIDANCE, Cell
+from lerobot_pf2mp.results.rows import NO_GUIDANCE
+from lerobot_pf2mp.results.summary import Cell
 
 _COLUMNS = (
     "task",

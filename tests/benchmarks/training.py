@@ -38,10 +38,10 @@ from torch.utils.data import DataLoader
 from torch.utils.data.dataloader import _BaseDataLoaderIter
 
 from lerobot_pf2mp import PF2MPConfig
+from lerobot_pf2mp.commands import train as pf2mp_train
 from lerobot_pf2mp.dataset_tools.maze.collect_maze import collect_maze
 from lerobot_pf2mp.policies.fmp.modeling_fmp import FMPPolicy
-from lerobot_pf2mp.policies.guided.modeling_guided import PotentialFieldGuidance
-from lerobot_pf2mp.training import train as pf2mp_train
+from lerobot_pf2mp.policies.guided.field_guidance import FieldGuidance
 from lerobot_pf2mp.training.in_memory_dataset import InMemoryDataset
 
 N_EPISODES = 300
@@ -86,7 +86,7 @@ NETWORK = ("forward", "backward", "gradient clipping", "optimiser")
 _WATCHED = (
     (_BaseDataLoaderIter, "__next__", "loader"),
     (DataProcessorPipeline, "__call__", "preprocessor"),
-    (PotentialFieldGuidance, "observe", "potential field"),
+    (FieldGuidance, "observe", "potential field"),
     (FMPPolicy, "forward", "forward"),
     (DiffusionPolicy, "forward", "forward"),
     (Accelerator, "backward", "backward"),

@@ -9,4 +9,3 @@ LETTER_HEIGHT = 0.18  # [m]
 REGION_GAP = 0.008  # between a letter and its regions [m]
 N_REGIONS = 2
 HANDWRITING_FPS = 10  # [Hz]
-HANDWRITING_STEPS = 64  # of an episode

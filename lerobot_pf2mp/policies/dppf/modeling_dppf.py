@@ -13,34 +13,74 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
 from lerobot_pf2mp.flow_matching import Guide
-from lerobot_pf2mp.hub.model_card import WithModelCard
 from lerobot_pf2mp.policies.dppf.configuration_dppf import DPPFConfig
-from lerobot_pf2mp.policies.guided.modeling_guided import GuidedPolicy
+from lerobot_pf2mp.policies.guided.field_guidance import FieldGuidance
+from lerobot_pf2mp.policies.model_card import WithModelCard
 from lerobot_pf2mp.policies.without_peft import WithoutPEFT
 
 
-class DPPFPolicy(GuidedPolicy, WithoutPEFT, WithModelCard, DiffusionPolicy):
-    """Differs from `DiffusionPolicy` by a guide in the denoising loop, and by showing the field what it learns from."""
+class DPPFPolicy(WithoutPEFT, WithModelCard, DiffusionPolicy):
+    """Differs from `DiffusionPolicy` in three points, like `PF2MPPolicy` from `FMPPolicy`.
+
+    These are what training shows the field, the bent denoising, and the checked plan. The weights are those of
+    `DiffusionPolicy`, and with ``guidance_scale=0`` so are the actions.
+
+    Args:
+        config: The policy's configuration.
+        dataset_stats: Statistics of the training dataset; None at evaluation.
+        dataset_meta: Its metadata (not used).
+    """
 
     config_class = DPPFConfig
     name = "dppf"
     config: DPPFConfig
 
+    def __init__(
+        self,
+        config: DPPFConfig,
+        dataset_stats: dict[str, dict[str, Any]] | None = None,
+        dataset_meta: Any = None,
+        **kwargs: Any,
+    ) -> None:
+        # Before the set-up of DiffusionPolicy, which ends in `reset`.
+        self.guidance = FieldGuidance(config, dataset_stats)
+        super().__init__(config, **kwargs)
+
+    def forward(self, batch: dict[str, Any], *args: Any, **kwargs: Any) -> tuple[Tensor, None]:
+        """The loss of `DiffusionPolicy`; in training, the batch's actions also go to the potential field."""
+        if self.training and torch.is_grad_enabled():
+            self.guidance.observe(batch)
+        return super().forward(batch, *args, **kwargs)
+
     @torch.no_grad()
     def predict_action_chunk(
         self, batch: dict[str, Any], noise: Tensor | None = None, guide: Guide | None = None
     ) -> Tensor:
-        """The next `n_action_steps` actions, ``(B, n_action_steps, action_dim)`` [normalised].
+        """The chunk of `DiffusionPolicy`, every denoising step bent by the guide, and then checked.
 
         Args:
             batch: Normalised observations, as for `DiffusionPolicy.predict_action_chunk`, with the potential field. Without
                 past `select_action` calls, a single frame stands for the whole window.
             noise: ``(B, horizon, action_dim)`` the sample to denoise; drawn from N(0, I) if None.
-            guide: Bends every denoising step, in place of the configured guidance; None for that.
+            guide: Bends every denoising step instead of the configured guidance; None for that.
+
+        Raises:
+            ValueError: If there is guidance, or a check, and the batch holds no field or one over other dimensions.
         """
-        with self._guided(guide or self.make_guide(batch)):
+        guide = guide or self.guidance.guide(batch, next(self.parameters()).device)
+        with self._guided(guide):
             chunk = super().predict_action_chunk(self._with_window(batch), noise=noise)
-        return self.check_chunk(batch, chunk)
+        return self.guidance.check(batch, chunk)
+
+    def reset(self) -> None:
+        """Forgets past observations and planned actions; to be called when an episode begins."""
+        super().reset()
+        self.guidance.reset()
+
+    @property
+    def support(self) -> Tensor | None:
+        """``(B, T)`` how far the last chunk's actions are inside the demonstrated region, see `FieldGuidance.support`."""
+        return self.guidance.support
 
     def _with_window(self, batch: dict[str, Any]) -> dict[str, Any]:
         if any(self._queues.values()):

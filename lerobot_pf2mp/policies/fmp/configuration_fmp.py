@@ -33,7 +33,7 @@ class FMPConfig(PreTrainedConfig):
         resize_shape: (H, W) that images are resized to; None leaves them.
         crop_ratio: Crop size as a fraction of `resize_shape`; 1 does not crop.
         crop_shape: (H, W) of the crop [pixels]; follows from `resize_shape` and `crop_ratio` if those are given.
-        crop_is_random: Whether training crops at random places; evaluation always crops the centre.
+        crop_is_random: Whether training crops at random positions; evaluation always crops the centre.
         pretrained_backbone_weights: Torchvision weights to start from; None starts at random.
         use_group_norm: Whether group norm replaces batch norm in the backbone.
         spatial_softmax_num_keypoints: Keypoints for each image.

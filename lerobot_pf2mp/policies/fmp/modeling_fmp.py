@@ -15,11 +15,11 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
 from lerobot_pf2mp.flow_matching import Guide, flow_matching_loss, integrate, sample_time
-from lerobot_pf2mp.hub.model_card import WithModelCard
 from lerobot_pf2mp.policies.fmp.configuration_fmp import FMPConfig
 from lerobot_pf2mp.policies.fmp.ema import MovingAverage
 from lerobot_pf2mp.policies.fmp.networks import VelocityNetwork
 from lerobot_pf2mp.policies.fmp.real_time_chunking import continuing
+from lerobot_pf2mp.policies.model_card import WithModelCard
 from lerobot_pf2mp.policies.without_peft import WithoutPEFT
 
 ACTION_IS_PAD = f"{ACTION}_is_pad"
@@ -157,7 +157,7 @@ class FMPPolicy(WithoutPEFT, WithModelCard, PreTrainedPolicy):
                 `n_obs_steps` > 1.
             noise: ``(B, horizon, action_dim)`` prior sample x_0; drawn from N(0, I) if None.
             generator: Source of randomness for that draw.
-            guide: Bends every step, in place of the configured guidance; None for that.
+            guide: Bends every integration step; None leaves the flow as it is.
             inference_delay: Real-time chunking: steps that are executed before this chunk is there.
             prev_chunk_left_over: Real-time chunking: ``([B,] T_left, action_dim)`` the last chunk's actions that have not
                 been executed [normalised]; None begins afresh.
@@ -188,13 +188,13 @@ class FMPPolicy(WithoutPEFT, WithModelCard, PreTrainedPolicy):
             noise.to(device=condition.device, dtype=torch.float32),
             self.config.num_inference_steps,
             integrator=self.config.integrator,
-            guide=guide or self.make_guide(batch),
+            guide=guide,
             steer=steer,
         )  # (B, T, A)
         start = self.config.n_obs_steps - 1
         if self._rtc_processor is not None:
-            return self.check_chunk(batch, chunk[:, start:])
-        return self.check_chunk(batch, chunk[:, start : start + self.config.n_action_steps])
+            return chunk[:, start:]
+        return chunk[:, start : start + self.config.n_action_steps]
 
     @torch.no_grad()
     def select_action(
@@ -226,14 +226,6 @@ class FMPPolicy(WithoutPEFT, WithModelCard, PreTrainedPolicy):
             chunk = self.predict_action_chunk({**batch, **window}, noise=noise, generator=generator)
             self._queues[ACTION].extend(chunk.unbind(dim=1))
         return self._queues[ACTION].popleft()
-
-    def make_guide(self, batch: dict[str, Any]) -> Guide | None:
-        """What bends the flow for this batch: nothing."""
-        return None
-
-    def check_chunk(self, batch: dict[str, Any], chunk: Tensor) -> Tensor:
-        """The actions ``(B, T, A)`` to execute of a planned chunk: all of them, as they are."""
-        return chunk
 
     @property
     def _observation_keys(self) -> list[str]:

@@ -92,7 +92,7 @@ class VelocityNetwork(nn.Module):
         """The velocity, ``(B, horizon, action_dim)``, float32 also under autocast.
 
         Args:
-            x_t: ``(B, horizon, action_dim)`` chunks on the way from noise to data [normalised].
+            x_t: ``(B, horizon, action_dim)`` chunks between noise and data, x_t [normalised].
             t: ``(B,)`` times in [0, 1].
             condition: ``(B, encoder.output_dim)`` encoded observations.
         """

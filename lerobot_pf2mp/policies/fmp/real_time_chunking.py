@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Real-time chunking (Black et al., 2025, arXiv:2506.07339): a new chunk goes on from the one that is being executed.
 
-The method is LeRobot's, which counts time from 1 (noise) to 0 (data). This is the one place where it is turned round.
+The method is LeRobot's, which counts time from 1 (noise) to 0 (data). Time is reversed here and nowhere else.
 """
 
 from __future__ import annotations

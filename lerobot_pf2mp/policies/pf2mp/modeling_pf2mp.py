@@ -3,14 +3,83 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lerobot_pf2mp.flow_matching import Guide
 from lerobot_pf2mp.policies.fmp.modeling_fmp import FMPPolicy
-from lerobot_pf2mp.policies.guided.modeling_guided import GuidedPolicy
+from lerobot_pf2mp.policies.guided.field_guidance import FieldGuidance
 from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
 
 
-class PF2MPPolicy(GuidedPolicy, FMPPolicy):
-    """Differs from `FMPPolicy` by a guide in the integration, and by showing the field what it learns from."""
+class PF2MPPolicy(FMPPolicy):
+    """Differs from `FMPPolicy` in three points: what training shows the field, the bent flow, and the checked plan.
+
+    The weights are those of `FMPPolicy`, and with ``guidance_scale=0`` so are the actions. An observation passes
+
+        select_action -> predict_action_chunk (below: guide) -> FMPPolicy.predict_action_chunk
+            -> integrate (each step: velocity, guide) -> VelocityNetwork
+
+    Args:
+        config: The policy's configuration.
+        dataset_stats: Statistics of the training dataset; None at evaluation.
+        dataset_meta: Its metadata (not used).
+    """
 
     config_class = PF2MPConfig
     name = "pf2mp"
     config: PF2MPConfig
+
+    def __init__(
+        self,
+        config: PF2MPConfig,
+        dataset_stats: dict[str, dict[str, Any]] | None = None,
+        dataset_meta: Any = None,
+        **kwargs: Any,
+    ) -> None:
+        # Before the set-up of FMPPolicy, which ends in `reset`.
+        self.guidance = FieldGuidance(config, dataset_stats)
+        super().__init__(config, dataset_stats, dataset_meta, **kwargs)
+
+    def forward(self, batch: dict[str, Any], reduction: str = "mean") -> tuple[Tensor, None]:
+        """The loss of `FMPPolicy`; in training, the batch's actions also go to the potential field."""
+        if self.training and torch.is_grad_enabled():
+            self.guidance.observe(batch)
+        return super().forward(batch, reduction)
+
+    @torch.no_grad()
+    def predict_action_chunk(
+        self,
+        batch: dict[str, Any],
+        noise: Tensor | None = None,
+        generator: torch.Generator | None = None,
+        guide: Guide | None = None,
+        **options: Any,
+    ) -> Tensor:
+        """The chunk of `FMPPolicy`, its flow bent by the guide in every integration step, and then checked.
+
+        Args:
+            batch: As for `FMPPolicy.predict_action_chunk`, with the potential field.
+            noise: As there.
+            generator: As there.
+            guide: Bends every step instead of the configured guidance; None for that.
+            **options: Those of real-time chunking, as there.
+
+        Raises:
+            ValueError: If there is guidance, or a check, and the batch holds no field or one over other dimensions.
+        """
+        guide = guide or self.guidance.guide(batch, next(self.parameters()).device)
+        chunk = super().predict_action_chunk(batch, noise, generator, guide, **options)
+        return self.guidance.check(batch, chunk)
+
+    def reset(self) -> None:
+        """Forgets past observations and planned actions; to be called when an episode begins."""
+        super().reset()
+        self.guidance.reset()
+
+    @property
+    def support(self) -> Tensor | None:
+        """``(B, T)`` how far the last chunk's actions are inside the demonstrated region, see `FieldGuidance.support`."""
+        return self.guidance.support

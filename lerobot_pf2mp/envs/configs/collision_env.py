@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What LeRobot's configurations of our environments (``--env.type=...``) have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+
+import gymnasium as gym
+from gymnasium.wrappers import AddRenderObservation, FilterObservation
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs.configs import EnvConfig
+from lerobot.envs.utils import freeze_after_episode_end
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_STATE
+
+from lerobot_pf2mp.envs.tasks import OBS_TYPES
+from lerobot_pf2mp.errors import ConfigError
+
+
+@dataclass
+class CollisionEnvConfig(EnvConfig):
+    """An environment that reports collisions.
+
+    Args:
+        features_map: What LeRobot calls each feature; an environment need not have all of them.
+        obs_type: state, or pixels_agent_pos: rendered images instead of the environment's state, beside the robot's.
+    """
+
+    features_map: dict[str, str] = field(
+        default_factory=lambda: {
+            ACTION: ACTION,
+            "agent_pos": OBS_STATE,
+            "environment_state": OBS_ENV_STATE,
+            "pixels": OBS_IMAGE,
+        }
+    )
+    obs_type: str = "state"
+
+    @property
+    def package_name(self) -> str:
+        """The package that registers the environments with Gymnasium."""
+        return "lerobot_pf2mp"
+
+    def create_envs(
+        self, n_envs: int, use_async_envs: bool = False
+    ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+        """The vectorised environment, ``{type: {0: env}}``.
+
+        Finished sub-environments are frozen until the next rollout. LeRobot's default resets them at once and then
+        counts the first reward of the next episode, here a collision, into the finished one.
+        """
+        # The prefix makes a worker process import the module that registers the environment.
+        make_env = partial(
+            gym.make,
+            f"lerobot_pf2mp:{self.gym_id}",
+            disable_env_checker=self.disable_env_checker,
+            **self.gym_kwargs,
+        )
+        if self.obs_type == "pixels_agent_pos":
+            make_env = partial(_with_pixels, make_env)
+        env_fns = [freeze_after_episode_end(make_env)] * n_envs
+        env: gym.vector.VectorEnv
+        autoreset_mode = gym.vector.AutoresetMode.NEXT_STEP
+        if use_async_envs and n_envs > 1:
+            env = gym.vector.AsyncVectorEnv(env_fns, context="forkserver", autoreset_mode=autoreset_mode)
+        else:
+            env = gym.vector.SyncVectorEnv(env_fns, autoreset_mode=autoreset_mode)
+        return {self.type: {0: env}}
+
+    def _describe(
+        self, action_dim: int, environment_dim: int, image_size: Callable[[], tuple[int, int]]
+    ) -> None:
+        """Sets `features`.
+
+        Args:
+            action_dim: Of the action and, as actions are positions, of the robot's state.
+            environment_dim: Of the environment's state; 0 without one.
+            image_size: Height and width of rendered images [pixels].
+
+        Raises:
+            ConfigError: If there is no such `obs_type`.
+        """
+        if self.obs_type not in OBS_TYPES:
+            raise ConfigError(f"obs_type must be one of {list(OBS_TYPES)}, got {self.obs_type!r}")
+        self.features = {
+            ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(action_dim,)),
+            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(action_dim,)),
+        }
+        if self.obs_type == "pixels_agent_pos":
+            pixels = PolicyFeature(type=FeatureType.VISUAL, shape=(*image_size(), 3))
+            self.features["pixels"] = pixels
+        elif environment_dim:
+            shape = (environment_dim,)
+            self.features["environment_state"] = PolicyFeature(type=FeatureType.ENV, shape=shape)
+
+
+def _with_pixels(make_env: Callable[[], gym.Env]) -> gym.Env:
+    return FilterObservation(AddRenderObservation(make_env(), render_only=False), ["agent_pos", "pixels"])

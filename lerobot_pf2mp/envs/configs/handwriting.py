@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""LeRobot's configuration of the handwriting environments (``--env.type=pf2mp_handwriting``)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from lerobot.envs.configs import EnvConfig
+
+from lerobot_pf2mp.envs.configs.collision_env import CollisionEnvConfig
+from lerobot_pf2mp.envs.handwriting.sheet import HANDWRITING_FPS, LETTER_HEIGHT, N_REGIONS, REGION_GAP
+from lerobot_pf2mp.envs.image_size import picture_size_of
+from lerobot_pf2mp.envs.tasks import HANDWRITING_STEPS, HANDWRITING_TASKS
+from lerobot_pf2mp.errors import ConfigError, reported_on_the_command_line
+
+if TYPE_CHECKING:
+    from lerobot_pf2mp.envs.handwriting.writing_scene import WritingScene
+
+
+@EnvConfig.register_subclass("pf2mp_handwriting")
+@dataclass
+class PF2MPHandwritingEnv(CollisionEnvConfig):
+    """The handwriting environments, `HandwritingEnv`.
+
+    Args:
+        task: HandwritingJoint-v0 (joint positions) or HandwritingPen-v0 (positions of the pen's tip).
+        fps: Control frequency [Hz], a divisor of 500.
+        episode_length: Steps after which an episode ends.
+        letter: What to write, one of `letters.LETTERS`.
+        letter_height: [m].
+        region_gap: Between the letter and the restricted regions [m].
+        n_regions: How many regions are put into the letter's bays.
+        scene_file: A JSON file with a stroke and regions of your own instead of a letter.
+        control: physics (position controllers in full physics) or exact (the arm reaches every action).
+        render_size: Width of the rendered image [pixels].
+        camera: arm (from the side) or top (the sheet alone).
+    """
+
+    task: str | None = "HandwritingJoint-v0"
+    fps: int = HANDWRITING_FPS
+    episode_length: int = HANDWRITING_STEPS
+    letter: str = "S"
+    letter_height: float = LETTER_HEIGHT
+    region_gap: float = REGION_GAP
+    n_regions: int = N_REGIONS
+    scene_file: str | None = None
+    control: str = "physics"
+    render_size: int = 640
+    camera: str = "arm"
+
+    def __post_init__(self) -> None:
+        """Validates the task and its scene.
+
+        Raises:
+            ConfigError: If there is no such task, or the scene does not work.
+        """
+        if self.task not in HANDWRITING_TASKS:
+            raise ConfigError(f"task must be one of {list(HANDWRITING_TASKS)}, got {self.task!r}")
+        with reported_on_the_command_line():
+            _ = self.scene
+            dim = 9 if HANDWRITING_TASKS[self.task] == "joint" else 2
+            self._describe(dim, 0, lambda: picture_size_of(self.render_size))
+
+    @property
+    def scene(self) -> WritingScene:
+        """The letter and the regions [m]."""
+        # Imported here because LeRobot imports this file for every command.
+        from lerobot_pf2mp.envs.handwriting.writing_scene import make_writing_scene
+
+        return make_writing_scene(**self._scene_options)
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """Arguments for ``gymnasium.make``."""
+        return {
+            **self._scene_options,
+            "max_episode_steps": self.episode_length,
+            "control": self.control,
+            "fps": self.fps,
+            "render_mode": "rgb_array",
+            "render_size": self.render_size,
+            "camera": self.camera,
+        }
+
+    @property
+    def _scene_options(self) -> dict[str, Any]:
+        names = ("letter", "letter_height", "region_gap", "n_regions", "scene_file")
+        return {name: getattr(self, name) for name in names}

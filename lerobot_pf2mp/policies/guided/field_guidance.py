@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The part of a guided policy that deals with the potential field.
+
+It shows the field what training saw, makes the guide from the field, and checks planned actions against it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import torch
+from lerobot.utils.constants import ACTION
+from torch import Tensor
+
+from lerobot_pf2mp.flow_matching import Guide
+from lerobot_pf2mp.guidance import GuidanceSettings, make_guide
+from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
+from lerobot_pf2mp.policies.guided.potential_field_step import POTENTIAL_FIELD
+from lerobot_pf2mp.policies.guided.support_monitor import SupportMonitor
+from lerobot_pf2mp.potential_field import PotentialField
+from lerobot_pf2mp.training.gathering import gather_rows
+
+if TYPE_CHECKING:
+    from lerobot_pf2mp.policies.dppf.configuration_dppf import DPPFConfig
+    from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
+
+    type GuidedPolicyConfig = PF2MPConfig | DPPFConfig
+
+
+class FieldGuidance:
+    """Guidance by a potential field, held by one policy.
+
+    The field itself is in the batch, put there by the policy's preprocessor (see `potential_field_step`).
+
+    Args:
+        config: The policy's configuration. Its options may change between two calls.
+        dataset_stats: Statistics of the training dataset; None at evaluation.
+    """
+
+    def __init__(
+        self, config: GuidedPolicyConfig, dataset_stats: dict[str, dict[str, Any]] | None = None
+    ) -> None:
+        self.config = config
+        self._dataset_id = _identify_dataset(dataset_stats, config)
+        self.demonstrations: DemonstratedActions | None = None  # those of the last training batch
+        self._monitor = SupportMonitor(config.on_unsupported, config.field_action_dims)
+        self._guide: Guide | None = None
+        self._made_from: tuple[PotentialField, GuidanceSettings] | None = None
+
+    def reset(self) -> None:
+        """Forgets the last plan; to be called when an episode begins."""
+        self._monitor.reset()
+
+    @property
+    def support(self) -> Tensor | None:
+        """``(B, T)`` log density of the last plan's actions above the field's threshold [nats], negative outside.
+
+        None before the first plan and with ``on_unsupported=ignore``.
+        """
+        return self._monitor.support
+
+    def observe(self, batch: dict[str, Any]) -> None:
+        """Shows the actions of a training batch to the field in it; a batch without a field changes nothing.
+
+        With several processes each field sees the batches of all of them, because only the main process saves its own.
+        They exchange B x T x (4 A + 1) bytes in every step, little beside the gradients.
+
+        Args:
+            batch: A training batch that the policy's own preprocessor has made.
+        """
+        demonstrations = batch.get(POTENTIAL_FIELD)
+        if demonstrations is None:
+            return
+        self.demonstrations = demonstrations
+        actions, is_pad, frames = gather_rows(
+            batch[ACTION], batch.get(f"{ACTION}_is_pad"), batch.get("index")
+        )
+        demonstrations.observe(
+            cast(Tensor, actions),
+            is_pad,
+            None if frames is None else frames + (1 - self.config.n_obs_steps),
+            settings=self.config.field_settings,
+            dataset_id=self._dataset_id,
+        )
+
+    @torch.compiler.disable  # the field may have to be fitted first
+    def guide(self, batch: dict[str, Any], device: torch.device) -> Guide | None:
+        """The configured guide over the batch's field; None with a guidance scale of 0.
+
+        A guide is made once for a field and settings, and kept until one of them changes.
+
+        Args:
+            batch: A batch that the policy's own preprocessor has made.
+            device: The device of the actions to be guided.
+
+        Raises:
+            ValueError: If the batch holds no field, or one over other dimensions.
+        """
+        settings = self.config.guidance_settings
+        if settings.scale == 0:
+            return None
+        made_from = fitted_field(batch.get(POTENTIAL_FIELD), self.config, device), settings
+        if made_from != self._made_from:
+            field, _ = made_from
+            self._guide, self._made_from = make_guide(field.prepared, settings), made_from
+        return self._guide
+
+    def check(self, batch: dict[str, Any], chunk: Tensor) -> Tensor:
+        """The actions ``(B, T, A)`` to execute of a planned chunk, see ``on_unsupported`` in `GuidedConfig`.
+
+        Args:
+            batch: A batch that the policy's own preprocessor has made.
+            chunk: ``(B, T, A)`` planned actions [normalised].
+
+        Raises:
+            ValueError: If they are checked, and the batch holds no field, or one over other dimensions.
+        """
+        return chunk if self.config.on_unsupported == "ignore" else self._monitored(batch, chunk)
+
+    @torch.compiler.disable  # the field may have to be fitted first
+    def _monitored(self, batch: dict[str, Any], chunk: Tensor) -> Tensor:
+        return self._monitor(chunk, fitted_field(batch.get(POTENTIAL_FIELD), self.config, chunk.device))
+
+
+def fitted_field(
+    demonstrations: object, config: GuidedPolicyConfig, device: torch.device | str = "cpu"
+) -> PotentialField:
+    """The potential field by which a policy is guided.
+
+    Args:
+        demonstrations: What the policy's preprocessor puts into a batch under `POTENTIAL_FIELD`.
+        config: The policy's configuration.
+        device: The device on which the field is used.
+
+    Raises:
+        ValueError: If there is no field, it is not fitted, or it covers other dimensions than the policy's.
+    """
+    if not isinstance(demonstrations, DemonstratedActions):
+        raise ValueError(
+            f"guidance needs the potential field, which the policy's own preprocessor puts under {POTENTIAL_FIELD!r}; "
+            "got a batch without it. Load the preprocessor from the checkpoint, or set guidance_scale=0"
+        )
+    field = demonstrations.field(config.field_settings, device)
+    dims = config.field_action_dims
+    n_dims = config.action_feature.shape[0] if dims is None else len(dims)
+    if field.dim != n_dims:
+        raise ValueError(
+            f"the potential field must cover {n_dims} action dimensions, got a field over {field.dim}: it belongs to "
+            "another policy"
+        )
+    return field
+
+
+def _identify_dataset(dataset_stats: dict[str, dict[str, Any]] | None, config: GuidedPolicyConfig) -> bytes:
+    """A digest of the action statistics and their normalisation, by which resuming and fine-tuning differ.
+
+    LeRobot reloads the saved preprocessor in both cases. With the same digest the sample goes on where it was; with
+    another one its points belong to other data, or to other units, and the sample starts afresh.
+    """
+    if not dataset_stats or ACTION not in dataset_stats:
+        return b""
+    digest = hashlib.sha256(str(config.normalization_mapping.get("ACTION")).encode())
+    for name, value in sorted(dataset_stats[ACTION].items()):
+        digest.update(name.encode())
+        digest.update(np.asarray(value, dtype=np.float64).tobytes())
+    return digest.digest()

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The model card of a policy of this package, as LeRobot asks for it when it publishes a checkpoint."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any
+
+from huggingface_hub import ModelCard
+
+from lerobot_pf2mp.hub.model_card import CardFacts, GuidanceFacts, PolicyFacts, env_options, make_model_card
+from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
+from lerobot_pf2mp.policies.guided.field_guidance import FieldGuidance
+from lerobot_pf2mp.potential_field import PotentialField
+
+
+class WithModelCard:
+    """A policy that is published with a card of this package, to be mixed into LeRobot's policies before their own class.
+
+    LeRobot 0.6 asks the policy for its card. Should a later one not ask, its own card is published.
+    """
+
+    config: Any
+
+    def generate_model_card(
+        self,
+        dataset_repo_id: str | None,
+        model_type: str,
+        license: str | None = None,
+        tags: Sequence[str] | None = None,
+        cfg: Any = None,
+        dataset_meta: Any = None,
+        **_: Any,
+    ) -> ModelCard:
+        """The card; the arguments are those of LeRobot's `PreTrainedPolicy.generate_model_card`."""
+        training = {} if cfg is None else cfg.to_dict()
+        facts = CardFacts(
+            policy=policy_facts(self.config, self._trained_field(), license, tags),
+            repo_id=self.config.repo_id or f"you/your_{model_type}",
+            dataset=dataset_repo_id,
+            dataset_size=dataset_meta and (dataset_meta.total_episodes, dataset_meta.total_frames),
+            training=training,
+            env_options=env_options(training.get("env")),
+        )
+        return make_model_card(facts)
+
+    def _trained_field(self) -> PotentialField | None:
+        """The field of the actions that the policy was just trained on; None if it has none."""
+        guidance: FieldGuidance | None = getattr(self, "guidance", None)
+        demonstrations = None if guidance is None else guidance.demonstrations
+        if demonstrations is not None:
+            with suppress(ValueError):  # not fitted, as in a training of no steps
+                return demonstrations.field(self.config.field_settings)
+        return None
+
+
+def policy_facts(
+    config: Any,
+    field: PotentialField | None,
+    license: str | None = None,
+    tags: Sequence[str] | None = None,
+) -> PolicyFacts:
+    """What a card says of a policy of this package.
+
+    Args:
+        config: Its configuration.
+        field: Its potential field; None if it has none, or none that is fitted.
+        license: Name of the licence; None for that of the configuration.
+        tags: Further tags; None for those of the configuration.
+    """
+    inputs, outputs = (
+        {name: tuple(feature.shape) for name, feature in (features or {}).items()}
+        for features in (config.input_features, config.output_features)
+    )
+    return PolicyFacts(
+        type=config.type,
+        inputs=inputs,
+        outputs=outputs,
+        horizon=config.horizon,
+        n_action_steps=config.n_action_steps,
+        num_inference_steps=config.num_inference_steps or config.num_train_timesteps,
+        guidance=_guidance_facts(config, field) if isinstance(config, GuidedConfig) else None,
+        license=license or config.license,
+        tags=tuple(tags or config.tags or ()),
+    )
+
+
+def _guidance_facts(config: GuidedConfig, field: PotentialField | None) -> GuidanceFacts:
+    return GuidanceFacts(
+        scale=config.guidance_scale,
+        integrator=config.guidance_integrator,
+        point=config.guidance_point,
+        action_dims=config.field_action_dims,
+        alpha=config.field_alpha,
+        bandwidth_rule=config.field_bandwidth if isinstance(config.field_bandwidth, str) else None,
+        bandwidth=None if field is None else field.bandwidth,
+        n_anchors=None if field is None else len(field.anchors),
+    )

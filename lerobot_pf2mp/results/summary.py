@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is counted from the episodes of a benchmark."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from scipy.stats import binomtest
+
+from lerobot_pf2mp.results.rate import Rate
+from lerobot_pf2mp.results.rows import EpisodeRow, SummaryRow
+
+
+def summarise(rows: Iterable[EpisodeRow]) -> list[SummaryRow]:
+    """Counts the episodes of every repeat and pairs each guided one with its unguided twin.
+
+    The twin is the same checkpoint and variant without guidance, on the same start-goal pairs and prior noise.
+
+    Args:
+        rows: Episodes.
+    """
+    repeats: dict[tuple[object, ...], list[EpisodeRow]] = {}
+    for row in rows:
+        repeats.setdefault(_repeat_of(row), []).append(row)
+    unguided = {
+        (*_twin_of(row), row.episode): row.collision
+        for episodes in repeats.values()
+        for row in episodes
+        if row.guidance_scale == 0
+    }
+    return [_summarise_repeat(episodes, unguided) for episodes in repeats.values()]
+
+
+def _repeat_of(row: EpisodeRow) -> tuple[object, ...]:
+    guidance = row.guidance_integrator, row.guidance_scale
+    return row.task, row.policy, *guidance, row.variant, row.seed, row.repeat, row.checkpoint
+
+
+def _twin_of(row: EpisodeRow) -> tuple[object, ...]:
+    return row.task, row.variant, row.seed, row.repeat, row.checkpoint
+
+
+def _summarise_repeat(
+    episodes: list[EpisodeRow], unguided: dict[tuple[object, ...], bool | None]
+) -> SummaryRow:
+    first = episodes[0]
+    twins = [unguided.get((*_twin_of(row), row.episode)) for row in episodes]
+    pairs = [(row.collision, twin) for row, twin in zip(episodes, twins, strict=True)]
+    is_paired = first.guidance_scale > 0 and all(None not in pair for pair in pairs)
+    return SummaryRow(
+        task=first.task,
+        policy=first.policy,
+        guidance_integrator=first.guidance_integrator,
+        guidance_scale=first.guidance_scale,
+        variant=first.variant,
+        seed=first.seed,
+        repeat=first.repeat,
+        n_episodes=len(episodes),
+        successes=sum(row.success for row in episodes),
+        collisions=_count_or_none([row.collision for row in episodes]),
+        plans_in_wall=_count_or_none([row.plan_in_wall for row in episodes]),
+        only_unguided_collides=sum(pair == (False, True) for pair in pairs) if is_paired else None,
+        only_guided_collides=sum(pair == (True, False) for pair in pairs) if is_paired else None,
+        min_clearance_m=_mean_or_none([row.min_clearance_m for row in episodes]),
+        path_length_m=_mean_or_none([row.path_length_m for row in episodes]),
+        stroke_error_mm=_mean_or_none([row.stroke_error_mm for row in episodes]),
+        chunk_latency_ms=first.chunk_latency_ms,
+        checkpoint=first.checkpoint,
+        commit=first.commit,
+    )
+
+
+def _count_or_none(values: Sequence[bool | None]) -> int | None:
+    return None if values[0] is None else sum(map(bool, values))
+
+
+def _mean_or_none(values: Sequence[float | None]) -> float | None:
+    present = [value for value in values if value is not None]
+    return round(statistics.fmean(present), 6) if present else None
+
+
+@dataclass(frozen=True)
+class Cell:
+    """All repeats and training seeds of one policy with one kind of guidance on one task.
+
+    Args:
+        repeats: The repeats, at least one.
+    """
+
+    repeats: tuple[SummaryRow, ...]
+
+    @property
+    def n_episodes(self) -> int:
+        """All episodes."""
+        return sum(row.n_episodes for row in self.repeats)
+
+    @property
+    def n_seeds(self) -> int:
+        """Training seeds."""
+        return len({row.seed for row in self.repeats})
+
+    @property
+    def collision(self) -> Rate | None:
+        """How many of all episodes collide; None if the environment does not report it."""
+        return self._rate_if_reported([row.collisions for row in self.repeats])
+
+    @property
+    def plan_in_wall(self) -> Rate | None:
+        """In how many of all episodes an action lies inside an obstacle; None if the environment does not report it."""
+        return self._rate_if_reported([row.plans_in_wall for row in self.repeats])
+
+    @property
+    def success(self) -> Rate:
+        """How many of all episodes reach the goal."""
+        return Rate(sum(row.successes for row in self.repeats), self.n_episodes)
+
+    @property
+    def stroke_error(self) -> float | None:
+        """Mean over all episodes [mm]; None if the environment does not report it."""
+        sums = [
+            row.n_episodes * row.stroke_error_mm for row in self.repeats if row.stroke_error_mm is not None
+        ]
+        return sum(sums) / self.n_episodes if sums else None
+
+    def deviation(self, count: str, over: str) -> float | None:
+        """Standard deviation of a rate over repeats or training seeds; None if there is only one.
+
+        Args:
+            count: collisions, plans_in_wall or successes.
+            over: repeat or seed; the other one is averaged over.
+        """
+        groups: dict[int, list[SummaryRow]] = {}
+        for row in self.repeats:
+            groups.setdefault(getattr(row, over), []).append(row)
+        rates = [
+            sum(getattr(row, count) or 0 for row in rows) / sum(row.n_episodes for row in rows)
+            for rows in groups.values()
+        ]
+        return statistics.stdev(rates) if len(rates) > 1 else None
+
+    def _rate_if_reported(self, counts: Sequence[int | None]) -> Rate | None:
+        reported = [count for count in counts if count is not None]
+        return Rate(sum(reported), self.n_episodes) if reported else None
+
+    @property
+    def mcnemar_p(self) -> float | None:
+        """Two-sided p-value of McNemar's exact test against the unguided twin; None without one.
+
+        The null hypothesis is that guidance turns as many clear episodes into collisions as the other way round
+        (McNemar, 1947).
+        """
+        fixed = [row.only_unguided_collides for row in self.repeats if row.only_unguided_collides is not None]
+        broken = [row.only_guided_collides for row in self.repeats if row.only_guided_collides is not None]
+        if not fixed:
+            return None
+        n = sum(fixed) + sum(broken)
+        return binomtest(sum(fixed), n).pvalue if n else 1.0
+
+
+def group_cells(rows: Iterable[SummaryRow]) -> list[Cell]:
+    """The repeats grouped by task, policy, guidance and variant, in the order of their first appearance."""
+    cells: dict[tuple[object, ...], list[SummaryRow]] = {}
+    for row in rows:
+        key = row.task, row.policy, row.guidance_integrator, row.guidance_scale, row.variant
+        cells.setdefault(key, []).append(row)
+    return [Cell(tuple(repeats)) for repeats in cells.values()]

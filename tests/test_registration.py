@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What importing the package registers, in which order ever, and what it does not import."""
+
+import subprocess
+import sys
+
+import pytest
+
+ARE_REGISTERED = """
+from lerobot.configs import PreTrainedConfig
+from lerobot.envs.configs import EnvConfig
+from lerobot.optim import OptimizerConfig
+from lerobot.processor import ProcessorStepRegistry
+import gymnasium
+assert {"fmp", "pf2mp", "dppf"} <= set(PreTrainedConfig.get_known_choices())
+assert {"pf2mp_maze", "pf2mp_fetch", "pf2mp_handwriting"} <= set(EnvConfig.get_known_choices())
+assert "fused_adamw" in OptimizerConfig.get_known_choices()
+assert "potential_field" in ProcessorStepRegistry.list()
+assert len([name for name in gymnasium.registry if name.startswith("lerobot_pf2mp/")]) == 7
+"""
+
+
+def run(code: str) -> str:
+    """What a new process prints that runs this code, without the current folder in its path."""
+    finished = subprocess.run(
+        [sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert finished.returncode == 0, finished.stderr
+    return finished.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "first",
+    [
+        "import lerobot_pf2mp",
+        "import lerobot, lerobot_pf2mp",
+        "import lerobot.policies, gymnasium, lerobot_pf2mp",
+        "import lerobot_policy_pf2mp",
+        "from lerobot_pf2mp import FMPConfig",
+        # Modules that register, as the first of all: the import of LeRobot in them must not meet them half imported.
+        "import lerobot_pf2mp.envs.configs.collision_env",
+        "import lerobot_pf2mp.policies.fmp.fused_adamw",
+        "import lerobot_pf2mp.policies.fmp.modeling_fmp",
+        "import lerobot_pf2mp.policies.guided.potential_field_step",
+    ],
+)
+def test_everything_is_registered_whatever_is_imported_first(first: str) -> None:
+    run(f"{first}\n{ARE_REGISTERED}")
+
+
+def test_the_maths_needs_torch_alone() -> None:
+    code = """
+import sys, torch
+before = set(sys.modules)
+from lerobot_pf2mp import flow_matching, guidance, potential_field
+print(*sorted({name.partition(".")[0] for name in set(sys.modules) - before}))
+"""
+    # torch brings numpy; it has not imported all of it.
+    assert set(run(code).split()) <= {"lerobot_pf2mp", "numpy"}
+
+
+def test_importing_the_package_imports_neither_lerobot_nor_torch() -> None:
+    code = """
+import sys, lerobot_pf2mp
+assert not {"lerobot", "torch", "gymnasium", "numpy"} & set(sys.modules)
+assert {"load_policy", "PF2MPConfig"} <= set(dir(lerobot_pf2mp))
+try:
+    lerobot_pf2mp.load_polcy
+except AttributeError as error:
+    print(error)
+"""
+    assert run(code).strip() == "module 'lerobot_pf2mp' has no attribute 'load_polcy'"
+
+
+def test_a_look_for_lerobot_leaves_it_as_it_is() -> None:
+    code = """
+import importlib.util, sys, lerobot_pf2mp
+finders = list(sys.meta_path)
+spec = importlib.util.find_spec("lerobot")
+assert spec.origin.endswith("__init__.py") and "lerobot" not in sys.modules
+assert sys.meta_path == finders
+import lerobot
+assert lerobot.__spec__.loader is lerobot.__loader__ and type(lerobot.__loader__).__name__ == "SourceFileLoader"
+assert sys.meta_path != finders
+print(lerobot.__version__)
+"""
+    assert run(code).startswith("0.6.")
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("pf2mp-info --version", "pf2mp-info 0."),
+        ("pf2mp-train --version", "pf2mp-train 0."),
+        ("pf2mp-collect --n_episode=3", "unrecognized arguments: --n_episode=3"),
+        ("pf2mp-push", "error: --path must be given"),
+        ("pf2mp-fit-field", "error: --policy.path must be given"),
+        ("pf2mp-train-expert", "error: --output_dir must be given"),
+        ("pf2mp-convert", "error: --source.path must name the recording, got none"),
+        ("pf2mp-train --in_memory_limit_gb=much", "must be a number [GB], got 'much'"),
+        ("pf2mp-collect --task=maze_largest", "task must be one of"),
+    ],
+)
+def test_an_answer_that_needs_no_lerobot_does_not_wait_for_it(command: str, message: str) -> None:
+    name, *arguments = command.split()
+    code = f"""
+import sys
+from importlib.metadata import entry_points
+sys.modules["lerobot"] = None  # importing it is an error
+sys.modules["torch"] = None
+sys.argv = ["{name}", *{arguments!r}]
+(script,) = entry_points(group="console_scripts", name="{name}")
+script.load()()
+"""
+    finished = subprocess.run(
+        [sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=60, check=False
+    )
+    said = finished.stdout + finished.stderr
+    assert message in said
+    assert "Traceback" not in said
