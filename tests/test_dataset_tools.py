@@ -17,6 +17,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
 from lerobot_pf2mp.dataset_tools.maze.collect_maze import collect_maze
+from lerobot_pf2mp.dataset_tools.maze.maze_dataset import maze_of, write_maze_dataset
 from lerobot_pf2mp.dataset_tools.maze.maze_expert import MazeExpert
 from lerobot_pf2mp.dataset_tools.writing import lerobot_writer
 from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory, prepare, resample
@@ -24,7 +25,7 @@ from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, writ
 from lerobot_pf2mp.envs.maze.maze_env import SUCCESS_RADIUS
 from lerobot_pf2mp.envs.maze.point_maze import BALL_RADIUS, make_point_maze
 from lerobot_pf2mp.envs.maze.swept_ball import SweptBall
-from lerobot_pf2mp.envs.tasks import MAZE_OF_TASK, maze_of, write_maze_dataset
+from lerobot_pf2mp.envs.tasks import MAZE_OF_TASK
 
 CORRIDOR = "1111111/1000001/1111111"
 SPEC = DatasetSpec(
