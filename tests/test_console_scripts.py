@@ -21,5 +21,5 @@ def test_a_console_script_explains_itself_and_complains_about_nothing(script: st
     assert result.returncode == 0, result.stderr
     # LeRobot's own command says what this machine lacks to read videos.
     assert result.stderr == "" or script == "pf2mp-train"
-    assert result.stdout.startswith(f"usage: {script} [-h]")
+    assert result.stdout.startswith(f"usage: {script} [")
     assert list(tmp_path.iterdir()) == []
