@@ -16,10 +16,10 @@ from .versions import EXTRAS, PACKAGES, extra_line, package_line, python_line, r
 
 
 def gather(seconds: float) -> list[Line]:
-    """Everything there is to say; what cannot be found out says why.
+    """Makes all lines of the report. A line that cannot be made contains the reason.
 
     Args:
-        seconds: Longest that each trial may take [s].
+        seconds: Largest duration of each trial [s].
     """
     with ThreadPoolExecutor() as pool:
         trials = [pool.submit(line_or_reason, name, partial(trial_line, name, seconds)) for name in LINES]
@@ -29,12 +29,12 @@ def gather(seconds: float) -> list[Line]:
 
 
 def is_well(lines: Sequence[Line]) -> bool:
-    """Whether nothing essential is wrong."""
+    """Whether no line names a problem."""
     return all(line.status != PROBLEM for line in lines)
 
 
 def as_text(lines: Sequence[Line]) -> str:
-    """A table with what to do at the end of its lines."""
+    """The report as a table. Remedies are at the ends of the lines."""
     name_width = max(len(line.name) for line in lines)
     value_width = max(len(line.value) for line in lines)
     rows = [
@@ -47,12 +47,12 @@ def as_text(lines: Sequence[Line]) -> str:
 
 
 def as_json(lines: Sequence[Line]) -> str:
-    """The same for programs and issue reports."""
+    """The report as JSON, for programs and issue reports."""
     return json.dumps({"ok": is_well(lines), "lines": [asdict(line) for line in lines]}, indent=2)
 
 
 def _version_lines() -> tuple[list[Line], list[Line]]:
-    """Lines of the packages, and of the extras."""
+    """The lines of the packages, and those of the extras."""
     lines = []
     try:
         wanted = ranges()

@@ -15,12 +15,12 @@ from lerobot_pf2mp.errors import explained
 def published_if_asked(
     repo_id: str | None, root: Path | None, push_to_hub: bool, private: bool | None
 ) -> Iterator[None]:
-    """Publishes the dataset that the block writes, if the command line asks for it.
+    """Publishes the dataset that a `with` block writes, if the command line asks for it.
 
-    What can be known before the block is checked before it. The arguments are the options of the same names.
+    The name and the login are checked before the block. The arguments are the options of the same names.
 
     Raises:
-        ValueError: If the dataset has no name of the form ``user/name``, or it cannot be published as asked.
+        ValueError: If the dataset has no name of the form ``user/name``, or it cannot be published with these options.
         OSError: If nobody is logged in, or the Hub cannot be reached or refuses.
     """
     if not push_to_hub:

@@ -229,7 +229,7 @@ class HandwritingEnv(gym.Env):
             start = start.clip(*SHEET_CORNERS)
         start = np.asarray(start, dtype=np.float64)
         if start.shape != (2,):
-            raise ValueError(f"start must be a finite position x, y [m], got {start.tolist()}")
+            raise ValueError(f"start must be finite positions x, y [m], got {start.tolist()}")
         check_on_sheet(start, "start")
         return self.kinematics.joints(start)
 
