@@ -38,7 +38,7 @@ def said_by(error: BaseException) -> str:
 
 
 def discovery() -> dict[str, Any]:
-    """Which of our policies and environments LeRobot's commands find, and the errors if they do not."""
+    """Our policies and environments that LeRobot's commands find, and the errors if they find none."""
     from lerobot.utils.import_utils import register_third_party_plugins
 
     reasons = []

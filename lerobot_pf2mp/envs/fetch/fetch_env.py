@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fetch behind a wall: gymnasium-robotics' Reach and Push with positions as actions, and with collision reports."""
+"""Fetch with a wall: gymnasium-robotics' Reach and Push with positions as actions, and with collision reports."""
 
 from __future__ import annotations
 

@@ -107,7 +107,7 @@ def make_writing_scene(
         scene_file: A JSON file with a stroke and regions instead of a letter, see `read_writing_scene`.
 
     Raises:
-        ValueError: If an argument breaks its rule, or the stroke is out of reach or blocked.
+        ValueError: If an argument breaks its rule, or the stroke leaves the sheet or is blocked by a region.
         FileNotFoundError: If there is no such file.
     """
     if scene_file is not None:
@@ -132,7 +132,7 @@ def read_writing_scene(path: Path) -> WritingScene:
             regions as for `region_of`.
 
     Raises:
-        ValueError: If the file does not describe a scene, or the stroke is out of reach or blocked.
+        ValueError: If the file does not describe a scene, or the stroke leaves the sheet or is blocked by a region.
         FileNotFoundError: If there is no such file.
     """
     try:
