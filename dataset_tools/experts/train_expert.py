@@ -87,7 +87,7 @@ def _found(folder: Path, wanted: ExpertSettings) -> ExpertCheckpoint | None:
     if name is not None:
         raise ValueError(
             f"{folder} holds an expert with another {name}, {checkpoint.settings.plain[name]} instead of "
-            f"{wanted.plain[name]}: choose another --output_dir, or the same settings to go on with its training"
+            f"{wanted.plain[name]}: choose another --output_dir, or the same settings to continue its training"
         )
     return checkpoint
 

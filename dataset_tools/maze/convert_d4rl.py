@@ -68,7 +68,7 @@ def _trajectories(
 def _find_starts(file: h5py.File, path: Path) -> tuple[np.ndarray, np.ndarray]:
     """The first row ``(E,)`` of each trajectory, and its goal ``(E, 2)`` in D4RL's coordinates [m]."""
     starts, start_goals = [], []
-    last_goal, is_over = file["infos/goal"][:1], True  # of the previous row
+    last_goal, is_over = file["infos/goal"][:1], True  # values of the previous row
     for first, goals in _slices(file, "infos/goal", path):
         is_last = np.zeros(len(goals), bool)
         if "timeouts" in file:

@@ -40,7 +40,7 @@ def write_video_dataset(
             if not n_written:
                 raise ValueError("a dataset must hold at least one episode, got none that is usable")
         finally:
-            # Also after an error: otherwise the encoder goes on writing into the folder after it has been removed.
+            # Also after an error. Otherwise the encoder continues to write into the folder after its removal.
             if dataset.has_pending_frames():
                 dataset.clear_episode_buffer()
             dataset.finalize()

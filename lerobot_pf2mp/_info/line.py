@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from .probes import said_by
+from .probes import message_of
 
 OK = "ok"
 OPTIONAL = "optional"  # missing, but needed only for the feature that the line names
@@ -35,4 +35,4 @@ def line_or_reason(name: str, make: Callable[[], Line]) -> Line:
     try:
         return make()
     except Exception as error:
-        return Line(name, "not known", PROBLEM, said_by(error))
+        return Line(name, "not known", PROBLEM, message_of(error))

@@ -31,7 +31,7 @@ _SIDE = 64  # side of the images [pixels]
 _LONGEST = 300  # longest message of an error [characters]
 
 
-def said_by(error: BaseException) -> str:
+def message_of(error: BaseException) -> str:
     """The type and message of an error, in one line of limited length."""
     words = " ".join([type(error).__name__ + ":" * bool(str(error)), *str(error).split()])
     return words if len(words) <= _LONGEST else words[: _LONGEST - 3] + "..."
@@ -49,7 +49,7 @@ def discovery() -> dict[str, Any]:
         def emit(self, record: logging.LogRecord) -> None:
             """Called for each message."""
             if record.exc_info and record.exc_info[1] and record.args == (DISTRIBUTION,):
-                reasons.append(said_by(record.exc_info[1]))
+                reasons.append(message_of(record.exc_info[1]))
 
     logging.getLogger().addHandler(Reasons())
     register_third_party_plugins()
@@ -102,7 +102,7 @@ def simulation() -> dict[str, Any]:
             env.close()
             errors[name] = ""
         except Exception as error:
-            errors[name] = said_by(error)
+            errors[name] = message_of(error)
     return {"errors": errors}
 
 
@@ -138,7 +138,7 @@ def video() -> dict[str, Any]:
                     file.mux(packet)
             answer["encoders"][encoder] = ""
         except Exception as error:
-            answer["encoders"][encoder] = said_by(error)
+            answer["encoders"][encoder] = message_of(error)
     return answer
 
 
@@ -202,7 +202,7 @@ def _main(name: str) -> None:
         try:
             answer = PROBES[name]()
         except BaseException as error:
-            answer = {"error": said_by(error)}
+            answer = {"error": message_of(error)}
         json.dump(answer, output)
 
 

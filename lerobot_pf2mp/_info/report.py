@@ -10,7 +10,7 @@ from dataclasses import asdict
 from functools import partial
 
 from .line import PROBLEM, Line, line_or_reason
-from .probes import said_by
+from .probes import message_of
 from .trials import LINES, train_line, trial_line
 from .versions import EXTRAS, PACKAGES, extra_line, package_line, python_line, ranges
 
@@ -58,7 +58,7 @@ def _version_lines() -> tuple[list[Line], list[Line]]:
         wanted = ranges()
     except Exception as error:
         wanted = {}
-        lines.append(Line("version ranges", "not checked", PROBLEM, said_by(error)))
+        lines.append(Line("version ranges", "not checked", PROBLEM, message_of(error)))
     lines.append(line_or_reason("python", lambda: python_line(wanted.get("python"))))
     for name in PACKAGES:
         lines.append(line_or_reason(name, partial(package_line, name, wanted.get(name))))

@@ -112,7 +112,7 @@ def _make_jobs(spec: BenchmarkSpec) -> list[Job]:
     for job, count in names.items():
         if count > 1:
             raise ValueError(
-                f"every policy must have a name of its own, got {job.policy!r} twice (guidance {job.guidance.integrator})"
+                f"every policy must have its own name, got {job.policy!r} twice (guidance {job.guidance.integrator})"
             )
     return jobs
 

@@ -21,11 +21,11 @@ def published_if_asked(
 
     Raises:
         ValueError: If the dataset has no name of the form ``user/name``, or it cannot be published with these options.
-        OSError: If nobody is logged in, or the Hub cannot be reached or refuses.
+        OSError: If the user is not logged in, or the Hub cannot be reached or refuses.
     """
     if not push_to_hub:
         if private is not None:
-            raise ValueError("--private says how to publish, which --push_to_hub=true asks for")
+            raise ValueError("--private needs --push_to_hub=true, which publishes the dataset")
         yield
         return
     from lerobot_pf2mp.hub.publish_dataset import publish_dataset

@@ -64,7 +64,7 @@ typedef struct {
     float *positions;  /* (G, D) relative to the centre */
     float *low, *high; /* (D,) corners of the box around them */
     float *nearest;    /* (G,) squared distances to the nearest anchor seen so far */
-    float *offsets;    /* (G, D) to that anchor, where these are asked for */
+    float *offsets;    /* (G, D) to that anchor; only for the aim NEAREST */
     Lanes *sums;       /* (G, 1 + D) of kernels, and of kernels times offsets, each relative to the nearest anchor's */
     double *totals;    /* (G, 1 + D) of what left `sums` */
     int *n_leaves;     /* (G,) that `sums` holds */

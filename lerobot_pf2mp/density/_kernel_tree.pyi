@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The C extension. All arrays are float32 and contiguous unless said otherwise; it releases the GIL while it works.
+"""The C extension. All arrays are float32 and contiguous unless stated otherwise. It releases the GIL while it works.
 
 A tree is what `KernelTree` holds: (leaves, boxes, centre, exponent_per_square, exponent_range). A ValueError is raised
 if the sizes of the arrays do not fit.

@@ -47,7 +47,7 @@ class KernelTree:
         boxes: ``(2 L - 1, 2, D)`` the lower and upper corner of each node's bounding box, relative to the centre.
         centre: ``(D,)`` the mean of the anchors. Subtracting it keeps float32 precise for points far from the origin.
         exponent_per_square: log2(e) / 2h^2. Times a squared distance it is the exponent e of a kernel 2^-e.
-        exponent_range: A kernel is left out if it is smaller than the nearest anchor's by more than this power of 2.
+        exponent_range: A kernel is left out if it is smaller than 2^-exponent_range times that of the nearest anchor.
     """
 
     leaves: Tensor
@@ -67,7 +67,7 @@ class KernelTree:
         positions = torch.full((-(-n_anchors // size) * size, dim), _MISSING)
         positions[:n_anchors] = (anchors - centre)[order].clamp(-_FARTHEST, _FARTHEST)
         leaves = positions.view(-1, size, dim)
-        # From left to right the leaves of the last level come first, but they have the last numbers.
+        # From left to right the leaves of the last level come first. In the numbering of nodes they come last.
         full_level = 2 ** (len(leaves).bit_length() - 1)
         leaves = leaves.roll(-2 * (len(leaves) - full_level), dims=0)
         return cls(
@@ -130,9 +130,9 @@ class KernelTree:
         Args:
             targets: The tree of the target points.
             queries: ``(Q, D)`` float32.
-            log_sum_threshold: Log sum above which a step does not go on towards a target.
+            log_sum_threshold: Log sum at the end of the first part above which there is no part towards a target.
             share: Fraction in [0, 1] of the offset to the local mean that a step covers.
-            max_distance: Largest distance that a step goes on towards the nearest target.
+            max_distance: Largest length of the part of a step towards the nearest target.
 
         Returns:
             ``(Q, D)`` the steps from the queries.

@@ -107,7 +107,7 @@ class InMemoryDataset(torch.utils.data.Dataset):
         return self.__getitems__([int(row)])[0]
 
     def __getitems__(self, rows: list[int]) -> SampleBatch:
-        """The samples of several rows; a DataLoader asks for whole batches here."""
+        """The samples of several rows. A DataLoader gets whole batches from this method."""
         index = torch.as_tensor(rows)
         index = torch.where(index < 0, index + len(self), index)
         batch = {key: column[index] for key, column in self._columns.items() if key not in self._windows}

@@ -20,7 +20,7 @@ WORKSPACE = Box.between((1.05, 0.45, 0.415), (1.55, 1.05, 0.80))
 HAND = Box.between((-0.040, -0.063, 0.052), (0.040, 0.063, 0.174))
 FINGERS = Box.between((-0.014, -0.015, -0.019), (0.014, 0.015, 0.059))
 BLOCK_SIZE = 0.05  # [m]
-BLOCK_HEIGHT = 0.425  # of the block's centre on the table [m]
+BLOCK_HEIGHT = 0.425  # z of the block's centre on the table [m]
 
 FETCH_FPS = 25  # [Hz], gymnasium-robotics' own
 SUCCESS_RADIUS = 0.05  # [m], gymnasium-robotics' own
@@ -168,7 +168,7 @@ class FetchScene:
         behind = layout.block - push / length * 2 * BLOCK_SIZE
         if np.any(behind[:2] < WORKSPACE.low[:2]) or np.any(behind[:2] > WORKSPACE.high[:2]):
             return False
-        radius = BLOCK_SIZE / math.sqrt(2) + _MARGIN  # of the circle in which the block can turn
+        radius = BLOCK_SIZE / math.sqrt(2) + _MARGIN  # for every rotation of the block
         pushed = Box((0, 0, 0), (2 * radius, 2 * radius, BLOCK_SIZE))
         return not (
             self.hits_wall(behind, layout.goal, _MARGIN)

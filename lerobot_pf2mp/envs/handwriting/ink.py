@@ -14,7 +14,7 @@ INK_HEIGHT = 0.007  # height of the tip up to which the pen draws [m]
 COVERED = 0.015  # a point of the letter counts as drawn if the ink is at most this far away [m]
 LARGEST_ERROR = 0.01  # mean distance of the ink to the letter [m]
 
-_SPACING = 0.001  # of the points of the ink at which its distance to the letter is measured [m]
+_SPACING = 0.001  # between the points of the ink at which its distance to the letter is measured [m]
 
 
 class Ink:
@@ -27,9 +27,9 @@ class Ink:
     def __init__(self, scene: WritingScene) -> None:
         self._scene = scene
         self.strokes: list[np.ndarray] = []  # each (N, 2) positions [m]
-        self.length = 0.0  # of all strokes [m]
+        self.length = 0.0  # total length of all strokes [m]
         self._is_covered = np.zeros(len(scene.stroke), dtype=bool)
-        self._integral = 0.0  # of the ink's distance to the letter over its length [m^2]
+        self._integral = 0.0  # distance of the ink to the letter, integrated over the ink's length [m^2]
         self._is_down = False
 
     def draw(self, tips: np.ndarray) -> float:
