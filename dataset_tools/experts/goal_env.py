@@ -16,8 +16,8 @@ from lerobot_pf2mp.envs.fetch.fetch_scene import SUCCESS_RADIUS, WORKSPACE
 from lerobot_pf2mp.envs.tasks import FETCH_STEPS
 
 EPISODE_STEPS = FETCH_STEPS
-# Of the gripper [m]. Where it turns, it overshoots by up to 0.4 mm, and steps beyond 0.03 m, `MAX_STEP` of the policies'
-# environment, are too long for a demonstration.
+# Largest step of the gripper [m]. Where it turns, it overshoots by up to 0.4 mm, and steps above 0.03 m, `MAX_STEP` of
+# `FetchEnv`, are too long for a demonstration.
 LARGEST_STEP = 0.028
 REWARDS = ("sparse", "dense")
 _DT = 0.04  # duration of a step [s]

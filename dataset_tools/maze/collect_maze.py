@@ -31,7 +31,7 @@ def collect_maze(
         n_episodes: Demonstrations to write.
         n_steps: Steps that each is resampled to.
         action_noise: Standard deviation of noise on the expert's normalised force.
-        seed: Seed of everything random.
+        seed: Seed of all random numbers.
         overwrite: Whether an existing dataset is replaced.
         image_width: Longer side of the images that are recorded instead of the goal's position [pixels]; None records no
             images.

@@ -8,7 +8,7 @@ import math
 import torch
 from torch import Tensor
 
-# Pairs (query, anchor) held at once: 2^20 float32 numbers, 4 MB, stay in a core's cache.
+# Pairs (query, anchor) in memory at once: 2^20 float32 numbers, 4 MB, stay in a core's cache.
 PAIRS_PER_BLOCK = 2**20
 
 # Scaled coordinates are clamped to this. A sum of a thousand of its squares still fits into a float32.
@@ -35,8 +35,8 @@ def log_kernels(queries: Tensor, anchors: Tensor, bandwidth: float) -> Tensor:
 
 
 def offsets_to_nearest(queries: Tensor, anchors: Tensor, bandwidth: float) -> Tensor:
-    """The offsets ``(Q, D)`` from queries ``(Q, D)`` to their nearest anchors, of ``(M, D)``, in blocks of pairs."""
-    # Float32 resolves differences between points, not their common offset.
+    """The offsets ``(Q, D)`` from queries ``(Q, D)`` to the nearest of the anchors ``(M, D)``, computed in blocks of pairs."""
+    # Centred first: float32 resolves differences between points, but not a large common offset.
     centre = anchors[0]
     centred = anchors - centre
     return torch.cat(

@@ -16,4 +16,4 @@ def image_size_of(render_size: int) -> tuple[int, int]:
     return 2 * round(3 * render_size / 8), 2 * (render_size // 2)
 
 
-picture_size_of = image_size_of  # name used by configs.py
+picture_size_of = image_size_of  # name used by envs/configs

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""LeRobot's own training function, with low-dimensional datasets held in memory.
+"""LeRobot's own training function, with low-dimensional datasets in memory.
 
 Reading one sample with an action window costs LeRobot's loader about 14 ms, many times the training step of a small
 network. The options, configuration, checkpoints, logs and resumption are those of ``lerobot-train``, and so are the

@@ -92,4 +92,4 @@ class MazeImage:
         draw.ellipse([x - half_size, y - half_size, x + half_size, y + half_size], fill=colour)
 
 
-MazePicture = MazeImage  # name used by configs.py
+MazePicture = MazeImage  # name used by envs/configs
