@@ -35,7 +35,7 @@ def log_kernels(queries: Tensor, anchors: Tensor, bandwidth: float) -> Tensor:
 
 
 def offsets_to_nearest(queries: Tensor, anchors: Tensor, bandwidth: float) -> Tensor:
-    """The offsets ``(Q, D)`` from queries ``(Q, D)`` to the nearest of the anchors ``(M, D)``, computed in blocks of pairs."""
+    """The offsets ``(Q, D)`` from queries ``(Q, D)`` to the nearest of anchors ``(M, D)``, in blocks of pairs."""
     # Centred first: float32 resolves differences between points, but not a large common offset.
     centre = anchors[0]
     centred = anchors - centre
