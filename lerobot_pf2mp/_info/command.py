@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 
 from .probes import DISTRIBUTION
-from .report import as_json, as_text, gather, is_well
+from .report import as_json, as_row, gather, is_well, verdict
 
 
 @dataclass
@@ -36,11 +36,15 @@ def main() -> None:
         print(f"pf2mp-info {version(DISTRIBUTION)}")
         return
     config = _parsed()
+    lines = []
     try:
-        lines = gather(config.time_limit)
+        for line in gather(config.time_limit):
+            lines.append(line)
+            if not config.json:
+                print(as_row(line), flush=True)
     except KeyboardInterrupt:
         sys.exit(130)
-    print((as_json if config.json else as_text)(lines))
+    print(as_json(lines) if config.json else verdict(lines))
     sys.exit(0 if is_well(lines) else 1)
 
 
