@@ -24,10 +24,11 @@ from scipy.sparse.csgraph import shortest_path
 from test_convert import write_minari
 
 from lerobot_pf2mp.commands import cli
+from lerobot_pf2mp.dataset_tools.experts.recording import Recording
 from lerobot_pf2mp.dataset_tools.fetch import collect_fetch as collecting
 from lerobot_pf2mp.dataset_tools.fetch.collect_fetch import collect_fetch
 from lerobot_pf2mp.dataset_tools.fetch.convert_fetch import convert_fetch, read_fetch
-from lerobot_pf2mp.dataset_tools.fetch.fetch_expert import STYLES, Recording, ScriptedFetchExpert
+from lerobot_pf2mp.dataset_tools.fetch.fetch_expert import STYLES, ScriptedFetchExpert
 from lerobot_pf2mp.dataset_tools.fetch.fetch_routes import length, routes, walk
 from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory, prepare
 from lerobot_pf2mp.envs.box import Box

@@ -11,7 +11,7 @@ import numpy as np
 from lerobot_pf2mp.dataset_tools.experts.expert_checkpoint import ExpertCheckpoint
 from lerobot_pf2mp.dataset_tools.experts.expert_settings import to_plain
 from lerobot_pf2mp.dataset_tools.experts.goal_env import EPISODE_STEPS, FetchGoalEnv
-from lerobot_pf2mp.dataset_tools.fetch.fetch_expert import Recording
+from lerobot_pf2mp.dataset_tools.experts.recording import Recording
 from lerobot_pf2mp.envs.fetch.fetch_env import FetchEnv
 from lerobot_pf2mp.envs.fetch.fetch_scene import FetchScene
 

@@ -14,8 +14,9 @@ import numpy as np
 
 from lerobot_pf2mp.dataset_tools.experts.expert_checkpoint import ExpertCheckpoint
 from lerobot_pf2mp.dataset_tools.experts.learned_expert import LearnedFetchExpert, check_scene
+from lerobot_pf2mp.dataset_tools.experts.recording import Recording
 from lerobot_pf2mp.dataset_tools.fetch.fetch_dataset import fetch_spec
-from lerobot_pf2mp.dataset_tools.fetch.fetch_expert import STYLES, Recording, ScriptedFetchExpert
+from lerobot_pf2mp.dataset_tools.fetch.fetch_expert import STYLES, ScriptedFetchExpert
 from lerobot_pf2mp.dataset_tools.writing.attempts import successful
 from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory, resample
 from lerobot_pf2mp.dataset_tools.writing.write_trajectories import write_trajectories
