@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from lerobot_pf2mp.commands.command import dataset_place
+from lerobot_pf2mp.commands.command import dataset_name_and_root
 from lerobot_pf2mp.errors import explained
 
 
@@ -31,7 +31,7 @@ def published_if_asked(
     from lerobot_pf2mp.hub.publish_dataset import publish_dataset
     from lerobot_pf2mp.hub.publishing import check_destination
 
-    repo_id, root = dataset_place(check_destination(repo_id), root, "")
+    repo_id, root = dataset_name_and_root(check_destination(repo_id), root, "")
     yield
     with explained(f"the dataset was written to {root}"):
         url = publish_dataset(root, repo_id, private=private)

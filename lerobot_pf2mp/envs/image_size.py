@@ -14,6 +14,3 @@ def image_size_of(render_size: int) -> tuple[int, int]:
     if render_size < 32:
         raise ValueError(f"render_size must be at least 32 pixels, got {render_size}")
     return 2 * round(3 * render_size / 8), 2 * (render_size // 2)
-
-
-picture_size_of = image_size_of  # name used by envs/configs

@@ -90,6 +90,3 @@ class MazeImage:
         x, y = self._pixel(position)
         half_size = radius * self._zoom
         draw.ellipse([x - half_size, y - half_size, x + half_size, y + half_size], fill=colour)
-
-
-MazePicture = MazeImage  # name used by envs/configs
