@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def open_minari(path: Path) -> MinariDataset:
-    """The Minari dataset in a folder.
+    """Opens the Minari dataset in a folder.
 
     Args:
         path: The dataset's folder, for example ``~/.minari/datasets/D4RL/pointmaze/large-v2``, or the folder ``data`` in it.

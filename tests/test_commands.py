@@ -560,7 +560,7 @@ def test_collect_takes_demonstrations_in_fetch(
         (["--scene.goal_range=[[1,2],[3,4]]"], "error: goal_range must be two corners of 3 coordinates"),
         (["--scene.wall_size=tall"], "error: `scene.wall_size`"),
         (
-            ["--obs_type=pixels_agent_pos", "--picture_width=3"],
+            ["--obs_type=pixels_agent_pos", "--image_width=3"],
             "error: render_size must be at least 32 pixels, got 3",
         ),
         (["--expert=nowhere"], "error: nowhere must be a folder written by pf2mp-train-expert"),

@@ -26,10 +26,11 @@ from lerobot.datasets import LeRobotDataset
 from scipy.sparse.csgraph import shortest_path
 
 from lerobot_pf2mp.commands import cli
+from lerobot_pf2mp.dataset_tools.experts.recording import Recording
 from lerobot_pf2mp.dataset_tools.fetch import collect_fetch as collecting
 from lerobot_pf2mp.dataset_tools.fetch.collect_fetch import collect_fetch
 from lerobot_pf2mp.dataset_tools.fetch.convert_fetch import convert_fetch, read_fetch
-from lerobot_pf2mp.dataset_tools.fetch.fetch_expert import STYLES, Recording, ScriptedFetchExpert
+from lerobot_pf2mp.dataset_tools.fetch.fetch_expert import STYLES, ScriptedFetchExpert
 from lerobot_pf2mp.dataset_tools.fetch.fetch_routes import length, routes, walk
 from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory, prepare
 from lerobot_pf2mp.envs.box import Box
@@ -1017,7 +1018,7 @@ REACH, ROWS, PUSH = (
         (
             "push",  # a Panda at the origin
             {name: values - np.array(1.3) for name, values in PUSH.items()},
-            r"about where Fetch can reach, .* got \[-0.15, .* in episode 0 of .*: of another robot",
+            r"about where Fetch can reach, .* got \[-0.15, .* in episode 0 of .*: is it from another robot",
         ),
         (
             "reach",

@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 from lerobot_pf2mp.commands import cli
 from lerobot_pf2mp.dataset_tools.handwriting.collect_handwriting import collect_handwriting
 from lerobot_pf2mp.dataset_tools.handwriting.convert_handwriting import convert_handwriting
-from lerobot_pf2mp.dataset_tools.handwriting.handwriting_expert import ScriptedScribe, vary
+from lerobot_pf2mp.dataset_tools.handwriting.handwriting_expert import ScriptedHandwritingExpert, vary
 from lerobot_pf2mp.dataset_tools.handwriting.handwriting_recording import read_handwriting
 from lerobot_pf2mp.dataset_tools.writing.attempts import successful
 from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory
@@ -68,7 +68,7 @@ def env_of(space: str, control: str = "physics") -> HandwritingEnv:
 
 @cache
 def demonstrations(space: str) -> list[Trajectory | str]:
-    scribe = ScriptedScribe(env_of(space), N_STEPS, seed=0)
+    scribe = ScriptedHandwritingExpert(env_of(space), N_STEPS, seed=0)
     return [scribe.demonstrate(number) for number in range(N_DEMONSTRATIONS)]
 
 
@@ -246,13 +246,13 @@ def test_a_way_that_enters_a_region_is_no_demonstration_although_the_arm_cuts_th
         scene = write_json(tmp_path / "scene.json", {"stroke": stroke.tolist(), "regions": [disc]})
         other = HandwritingEnv("joint", scene_file=scene)
         assert other.scene.clearance(way) == pytest.approx(-depth, abs=2e-6)
-        result = ScriptedScribe(other, N_STEPS, seed=0).demonstrate(number)
+        result = ScriptedHandwritingExpert(other, N_STEPS, seed=0).demonstrate(number)
         assert (result if isinstance(result, str) else None) == expected
 
 
 def test_a_way_from_which_the_arm_strays_into_a_region_is_in_collision(tmp_path: Path) -> None:
     env, n_steps = HandwritingEnv("pen", n_regions=0), 12  # so fast that it lags behind
-    way = ScriptedScribe(env, n_steps, seed=0).demonstrate(0).positions
+    way = ScriptedHandwritingExpert(env, n_steps, seed=0).demonstrate(0).positions
     drawn = np.concatenate(env.ink.strokes)
     away = np.minimum(distances(drawn, way), distances(drawn, env.scene.stroke))
     assert away.max() > 0.0025
@@ -260,14 +260,14 @@ def test_a_way_from_which_the_arm_strays_into_a_region_is_in_collision(tmp_path:
     scene = write_json(tmp_path / "scene.json", {"stroke": env.scene.stroke.tolist(), "regions": [disc]})
     other = HandwritingEnv("pen", scene_file=scene)
     assert other.scene.clearance(way) > 0.0009
-    assert ScriptedScribe(other, n_steps, seed=0).demonstrate(0) == "in collision"
+    assert ScriptedHandwritingExpert(other, n_steps, seed=0).demonstrate(0) == "in collision"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("space", SPACES)
 def test_no_demonstration_leaves_the_sheet(space: str) -> None:
     env = HandwritingEnv(space, "O", letter_height=0.31, n_regions=0)
-    scribe = ScriptedScribe(env, 16, seed=0)
+    scribe = ScriptedHandwritingExpert(env, 16, seed=0)
     attempts = [scribe.demonstrate(number) for number in range(8)]
     for attempt in attempts:
         if isinstance(attempt, Trajectory):
@@ -305,16 +305,18 @@ def test_joints_and_places_of_a_demonstration_are_the_same_way_along_the_letter(
 @pytest.mark.slow
 def test_a_demonstration_depends_on_its_seed_and_number_and_not_on_those_before() -> None:
     expected = demonstrations("joint")
-    scribe = ScriptedScribe(HandwritingEnv("joint"), N_STEPS, seed=0)
+    scribe = ScriptedHandwritingExpert(HandwritingEnv("joint"), N_STEPS, seed=0)
     for number in (3, 0, 3):
         np.testing.assert_array_equal(scribe.demonstrate(number).positions, expected[number].positions)
-    other = ScriptedScribe(env_of("joint"), N_STEPS, seed=1).demonstrate(0)
+    other = ScriptedHandwritingExpert(env_of("joint"), N_STEPS, seed=1).demonstrate(0)
     for left, right in itertools.combinations([other.positions, *kept("joint")], 2):
         assert np.abs(left - right).max() > 0.01
 
 
 def test_a_letter_that_is_not_written_is_without_success() -> None:
-    scribe = ScriptedScribe(HandwritingEnv("pen", n_regions=0), 2, seed=0)  # two steps cut all curves
+    scribe = ScriptedHandwritingExpert(
+        HandwritingEnv("pen", n_regions=0), 2, seed=0
+    )  # two steps cut all curves
     assert scribe.demonstrate(0) == "without success"
 
 
@@ -429,7 +431,7 @@ def test_the_card_says_what_is_written_by_whom_and_in_which_units(
 
 def test_failed_demonstrations_are_left_out_of_the_dataset_and_counted(tmp_path: Path) -> None:
     options = straight(tmp_path, opening=0.006)
-    scribe = ScriptedScribe(HandwritingEnv("pen", **options), 2, seed=3)
+    scribe = ScriptedHandwritingExpert(HandwritingEnv("pen", **options), 2, seed=3)
     expected, failed = [], Counter()
     for number in itertools.count():
         attempt = scribe.demonstrate(number)
@@ -460,12 +462,12 @@ def test_a_scene_that_leaves_hardly_any_room_ends_in_an_error_and_nothing_writte
 def test_an_interruption_of_collecting_leaves_nothing_behind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[BaseException]
 ) -> None:
-    def interrupted(self: ScriptedScribe, number: int) -> Trajectory:
+    def interrupted(self: ScriptedHandwritingExpert, number: int) -> Trajectory:
         if number == 3:
             raise error("stop")
         return Trajectory(np.full((3, 2), 0.5))
 
-    monkeypatch.setattr(ScriptedScribe, "demonstrate", interrupted)
+    monkeypatch.setattr(ScriptedHandwritingExpert, "demonstrate", interrupted)
     with pytest.raises(error, match="stop"):
         collect("pen", tmp_path / "data" / "d", n_episodes=4)
     gc.collect()  # what is written when an object is deleted counts
@@ -1048,7 +1050,7 @@ def test_the_command_collects_a_letter_in_joints(tmp_path: Path, command: Callab
     assert dataset.features["action"]["names"] == AXES["joint"]
     assert dataset[0]["task"] == "Write 8 without entering a red region."
     env = HandwritingEnv("joint", "8", letter_height=0.15, n_regions=1)
-    first = ScriptedScribe(env, N_STEPS, seed=4).demonstrate(0)
+    first = ScriptedHandwritingExpert(env, N_STEPS, seed=4).demonstrate(0)
     np.testing.assert_allclose(frames_of(root)["observation.state"][0], first.positions[:-1], atol=1e-6)
 
 

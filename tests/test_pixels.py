@@ -17,7 +17,7 @@ from lerobot_pf2mp import PF2MPFetchEnv, PF2MPHandwritingEnv, PF2MPMazeEnv, load
 from lerobot_pf2mp.dataset_tools.fetch.collect_fetch import collect_fetch
 from lerobot_pf2mp.dataset_tools.handwriting.collect_handwriting import collect_handwriting
 from lerobot_pf2mp.dataset_tools.maze.collect_maze import collect_maze
-from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, picture_feature
+from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, image_feature
 from lerobot_pf2mp.dataset_tools.writing.video_writer import write_video_dataset
 from lerobot_pf2mp.errors import ConfigError
 
@@ -34,7 +34,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """A few demonstrations with pictures of every environment."""
     folder = tmp_path_factory.mktemp("data")
     roots = {name: folder / name for name in ENVS}
-    common = {"n_episodes": 3, "seed": 0, "overwrite": False, "picture_width": WIDTH}
+    common = {"n_episodes": 3, "seed": 0, "overwrite": False, "image_width": WIDTH}
     collect_maze("umaze", root=roots["maze"], repo_id="local/maze", n_steps=20, action_noise=0.0, **common)
     collect_fetch(
         "reach",
@@ -202,7 +202,7 @@ def test_a_policy_sees_every_camera_of_a_dataset(tmp_path: Path) -> None:
     cameras = ("observation.images.front", "observation.images.wrist")
     vector = {"dtype": "float32", "shape": (2,), "names": ["x", "y"]}
     features = {"observation.state": vector, "action": vector}
-    features |= {camera: picture_feature((64, 80)) for camera in cameras}
+    features |= {camera: image_feature((64, 80)) for camera in cameras}
     rng = np.random.default_rng(0)
     episodes = [
         {

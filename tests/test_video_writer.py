@@ -9,11 +9,11 @@ from lerobot.datasets import LeRobotDataset
 from lerobot_pf2mp.dataset_tools.fetch.collect_fetch import collect_fetch
 from lerobot_pf2mp.dataset_tools.fetch.fetch_dataset import fetch_spec
 from lerobot_pf2mp.dataset_tools.fetch.fetch_expert import ScriptedFetchExpert
-from lerobot_pf2mp.dataset_tools.writing.episodes import PICTURES, Trajectory, prepare
-from lerobot_pf2mp.dataset_tools.writing.video_writer import has_pictures, write_video_dataset
+from lerobot_pf2mp.dataset_tools.writing.episodes import IMAGE_KEY, Trajectory, prepare
+from lerobot_pf2mp.dataset_tools.writing.video_writer import has_images, write_video_dataset
 from lerobot_pf2mp.envs.fetch.fetch_env import FetchEnv
 
-SPEC = fetch_spec("reach", "local/reach", "Made up.", 6, picture_size=(48, 64))
+SPEC = fetch_spec("reach", "local/reach", "Made up.", 6, image_size=(48, 64))
 
 
 def episode(grey: int) -> dict[str, np.ndarray]:
@@ -25,7 +25,7 @@ def episode(grey: int) -> dict[str, np.ndarray]:
     return {
         "observation.state": positions,
         "action": positions,
-        PICTURES: pictures,
+        IMAGE_KEY: pictures,
     }
 
 
@@ -41,8 +41,8 @@ def test_pictures_and_numbers_read_back(tmp_path: Path) -> None:
         for frame in range(6):
             item = dataset[6 * number + frame]
             np.testing.assert_array_equal(item["action"], expected["action"][frame])
-            assert item[PICTURES].shape == (3, 48, 64)
-            assert 255 * float(item[PICTURES].mean()) == pytest.approx(grey + 10 * frame, abs=4)
+            assert item[IMAGE_KEY].shape == (3, 48, 64)
+            assert 255 * float(item[IMAGE_KEY].mean()) == pytest.approx(grey + 10 * frame, abs=4)
     assert (root / "README.md").read_text() == SPEC.card
 
 
@@ -58,17 +58,17 @@ def test_a_dataset_without_episodes_or_with_an_error_on_the_way_leaves_nothing(t
     assert not list(tmp_path.iterdir())
 
 
-def test_a_specification_has_pictures_only_if_asked_for() -> None:
-    assert has_pictures(SPEC)
-    assert not has_pictures(fetch_spec("reach", "local/reach", "Made up.", 6))
+def test_a_specification_has_images_only_if_asked_for() -> None:
+    assert has_images(SPEC)
+    assert not has_images(fetch_spec("reach", "local/reach", "Made up.", 6))
 
 
 @pytest.mark.parametrize("n_steps", [3, 6, 12])
 def test_each_frame_has_the_last_picture_before_it(n_steps: int) -> None:
     pictures = np.arange(7, dtype=np.uint8).reshape(-1, 1, 1, 1) * np.ones((1, 2, 2, 3), dtype=np.uint8)
-    trajectory = Trajectory(np.arange(21.0).reshape(7, 3), np.zeros(3), pictures=pictures)
+    trajectory = Trajectory(np.arange(21.0).reshape(7, 3), np.zeros(3), images=pictures)
     (frames,) = prepare([trajectory], n_steps, lambda way: False, Counter())
-    taken = frames[PICTURES][:, 0, 0, 0]
+    taken = frames[IMAGE_KEY][:, 0, 0, 0]
     position = frames["observation.state"][:, 0] / 3  # in steps of the recording
     assert taken.tolist() == np.floor(position + 1e-6).tolist()
 
@@ -86,7 +86,7 @@ def test_collected_pictures_are_those_of_the_environment(tmp_path: Path) -> None
         seed=3,
         n_processes=1,
         overwrite=False,
-        picture_width=64,
+        image_width=64,
     )
     assert n_written == 1
     dataset = LeRobotDataset("local/reach", root=tmp_path / "d")
@@ -95,5 +95,5 @@ def test_collected_pictures_are_those_of_the_environment(tmp_path: Path) -> None
     ).demonstrate(0)
     first, last = recording.pictures[0].astype(float), recording.pictures[-2].astype(float)
     for frame, picture, other in ((0, first, last), (47, last, first)):
-        shown = 255 * dataset[frame][PICTURES].permute(1, 2, 0).numpy()
+        shown = 255 * dataset[frame][IMAGE_KEY].permute(1, 2, 0).numpy()
         assert np.abs(shown - picture).mean() < 0.5 * np.abs(shown - other).mean()

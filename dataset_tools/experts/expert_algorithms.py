@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""PPO, and SAC with hindsight experience replay, of Stable-Baselines3, set up for the Fetch tasks."""
+"""Stable-Baselines3's PPO, and its SAC with hindsight experience replay, configured for the Fetch tasks."""
 
 from __future__ import annotations
 
@@ -29,24 +29,26 @@ ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ppo": PPO, "sac_her": SAC}
 
 
 class GoalFeatures(BaseFeaturesExtractor):
-    """Observation, goal and the way to it, in fixed units: positions within 0.3 m around 1 m are hard to learn from.
+    """Observation, goal, and the offset to the goal, in fixed units.
 
-    rl-baselines3-zoo scales FetchReach by running statistics for the same reason.
+    Positions within 0.3 m around 1 m are hard to learn from. rl-baselines3-zoo normalises FetchReach by running statistics
+    for the same reason.
 
     Args:
-        observation_space: That of `FetchGoalEnv`.
+        observation_space: The observation space of `FetchGoalEnv`.
     """
 
+    # These names are in the files of saved experts.
     _centre: torch.Tensor
     _scale: torch.Tensor
 
     def __init__(self, observation_space: spaces.Dict) -> None:
         size = observation_space["observation"].shape[0]  # type: ignore[index]
         super().__init__(observation_space, size + 6)
-        centre, scale = observation_units(has_block=size > 6)
+        centre, unit = observation_units(has_block=size > 6)
         # Positions of the gripper come first.
         self.register_buffer("_centre", torch.tensor([*centre, *centre[:3], 0, 0, 0], dtype=torch.float32))
-        self.register_buffer("_scale", torch.tensor([*scale, *scale[:3], *scale[:3]], dtype=torch.float32))
+        self.register_buffer("_scale", torch.tensor([*unit, *unit[:3], *unit[:3]], dtype=torch.float32))
 
     def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
         """Features ``(B, D + 6)``."""
@@ -56,14 +58,15 @@ class GoalFeatures(BaseFeaturesExtractor):
 
 
 class PenalisingReplayBuffer(HerReplayBuffer):
-    """Keeps the penalty for touching the wall when it gives a step another goal.
+    """A replay buffer that keeps the penalty for touching the wall when it relabels a step with another goal.
 
-    Stable-Baselines3 can keep the whole information of each step for that, which is slow and would have to be pickled.
+    Stable-Baselines3 can store the whole information of each step for that. But this is slow, and it would have to be
+    pickled.
 
     Args:
-        *args: For `HerReplayBuffer`.
+        *args: Arguments of `HerReplayBuffer`.
         collision_penalty: See `FetchGoalEnv`.
-        **options: For `HerReplayBuffer`.
+        **options: Arguments of `HerReplayBuffer`.
     """
 
     def __init__(self, *args: Any, collision_penalty: float, **options: Any) -> None:
@@ -85,7 +88,7 @@ class PenalisingReplayBuffer(HerReplayBuffer):
 
 
 def make_algorithm(settings: ExpertSettings, device: str) -> BaseAlgorithm:
-    """An untrained algorithm with its environments."""
+    """Makes an untrained algorithm with its environments."""
     parameters = settings.hyperparameters
     scene_changes = settings.plain["scene"]
     make = partial(make_goal_env, settings.task, scene_changes, settings.reward, settings.collision_penalty)
@@ -111,7 +114,7 @@ def make_algorithm(settings: ExpertSettings, device: str) -> BaseAlgorithm:
 
 
 def make_policy(settings: ExpertSettings) -> BasePolicy:
-    """The algorithm's untrained policy alone, without environments, on the CPU."""
+    """Makes the untrained policy of the algorithm, without environments, on the CPU."""
     policy_class = ALGORITHMS[settings.algo].policy_aliases["MultiInputPolicy"]
     observation_space, action_space = goal_spaces(settings.scene.has_block)
     return policy_class(

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Experts in a folder, without pickles.
+"""Saves experts in a folder and loads them, without pickles.
 
 ``expert.json`` holds the settings, the number of steps and the name of a folder beside it, with ``policy.safetensors``
 (weights; for SAC the entropy coefficient too), ``optimizers.pt`` (read with ``weights_only``) and for SAC
-``replay_buffer.npz``. It is replaced after that folder is complete, so that it always names a complete one.
+``replay_buffer.npz``. ``expert.json`` is replaced only after that folder is complete, so it always names a complete folder.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class ExpertCheckpoint:
 
     Args:
         folder: The folder.
-        settings: How it is trained.
+        settings: Its settings.
         n_steps: Environment steps that it was trained for.
     """
 
@@ -51,10 +51,10 @@ class ExpertCheckpoint:
 
     @classmethod
     def read(cls, folder: Path) -> ExpertCheckpoint:
-        """The expert in a folder.
+        """Reads the settings of the expert in a folder.
 
         Raises:
-            FileNotFoundError: If there is none.
+            FileNotFoundError: If there is no expert.
             ValueError: If it cannot be read.
         """
         path = folder / EXPERT_FILE
@@ -73,7 +73,7 @@ class ExpertCheckpoint:
 
     @property
     def description(self) -> str:
-        """Which expert it is, as the beginning of a sentence."""
+        """A description of the expert, as the beginning of a sentence."""
         settings = self.settings
         algorithm = {"ppo": "PPO", "sac_her": "SAC with hindsight experience replay"}[settings.algo]
         penalty = settings.collision_penalty and f", collision penalty {settings.collision_penalty:g}"
@@ -83,7 +83,7 @@ class ExpertCheckpoint:
         )
 
     def write(self, algorithm: BaseAlgorithm) -> None:
-        """Writes an algorithm's state; the folder's earlier one vanishes when this one is complete."""
+        """Writes an algorithm's state. The earlier state in the folder is removed when this one is complete."""
         try:
             self._write_files(algorithm)
             with file_written_beside(self.folder / EXPERT_FILE) as partial:
@@ -97,14 +97,14 @@ class ExpertCheckpoint:
                 shutil.rmtree(other)
 
     def _write_files(self, algorithm: BaseAlgorithm) -> None:
-        shutil.rmtree(self.files, ignore_errors=True)  # of a call that was killed
+        shutil.rmtree(self.files, ignore_errors=True)  # left by a call that was killed
         self.files.mkdir(parents=True)
         parameters = algorithm.get_parameters()
         weights = parameters.pop("policy")
         log_ent_coef = getattr(algorithm, _LOG_ENT_COEF, None)  # SAC's
         if log_ent_coef is not None:
             weights[_LOG_ENT_COEF] = log_ent_coef.detach()
-        # Cloned, as PPO's policy lists the same tensors under several names.
+        # Cloned, because PPO's policy lists the same tensors under several names.
         save_file({name: each.cpu().clone() for name, each in weights.items()}, self.files / _POLICY)
         torch.save(parameters, self.files / _OPTIMIZERS)
         buffer = getattr(algorithm, "replay_buffer", None)
@@ -112,7 +112,7 @@ class ExpertCheckpoint:
             np.savez(self.files / _BUFFER, allow_pickle=False, **_arrays_of(buffer))
 
     def load_into(self, algorithm: BaseAlgorithm) -> None:
-        """Gives an algorithm with the same settings the state that was written.
+        """Loads the saved state into an algorithm with the same settings.
 
         Raises:
             OSError: If a file is missing.
@@ -134,7 +134,7 @@ class ExpertCheckpoint:
             algorithm.num_timesteps = self.n_steps
 
     def load_policy(self) -> BasePolicy:
-        """The policy alone, on the CPU.
+        """Loads only the policy, on the CPU.
 
         Raises:
             ImportError: If Stable-Baselines3 is missing.

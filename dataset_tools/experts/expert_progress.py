@@ -9,7 +9,7 @@ from tqdm import tqdm
 
 
 class ExpertProgress(BaseCallback):
-    """Moves a bar and shows the success rate of the last 100 episodes, which explore.
+    """Advances a progress bar and shows the success rate of the last 100 episodes (with exploration).
 
     Args:
         bar: The bar, in environment steps.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What defines an expert trained by reinforcement learning, besides how long it is trained."""
+"""The settings of an expert trained by reinforcement learning, except the number of steps."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from typing import Any
 from lerobot_pf2mp.dataset_tools.experts.goal_env import EPISODE_STEPS, check_reward
 from lerobot_pf2mp.envs.fetch.fetch_scene import FETCH_SCENES, FetchScene, make_scene
 
-# Hyper-parameters by algorithm, under the names of Stable-Baselines3, which documents them. `options` changes them.
+# Hyperparameters by algorithm, with the names and meanings of Stable-Baselines3. `options` changes them.
 HYPERPARAMETERS: dict[str, dict[str, Any]] = {
-    # rl-baselines3-zoo has no entry for PPO on Fetch, whose sparse reward is weak for it. These are Stable-Baselines3's
-    # defaults (rollouts of 2048 steps in all, 10 epochs, clipping at 0.2) but for gamma and the learning rate, which are
-    # those of the zoo's Fetch entries, and larger batches, which cost less time.
+    # rl-baselines3-zoo has no entry for PPO on Fetch, because PPO learns little from Fetch's sparse reward. These are the
+    # defaults of Stable-Baselines3 (rollouts of 2048 steps in total, 10 epochs, clipping at 0.2) with three exceptions:
+    # gamma and the learning rate are those of the zoo's Fetch entries, and batches are larger, which takes less time.
     "ppo": {
         "n_envs": 4,
         "n_steps": 512,
@@ -50,15 +50,15 @@ _AT_MOST_1 = ("gamma", "gae_lambda", "clip_range", "tau")
 
 @dataclass(frozen=True)
 class ExpertSettings:
-    """Two trainings with the same settings and number of steps give the same expert.
+    """The settings of an expert. The same settings and the same number of steps give the same expert.
 
     Args:
         task: reach or push.
         algo: ppo, or sac_her: SAC with hindsight experience replay.
         reward: sparse or dense, see `FetchGoalEnv`.
         collision_penalty: Subtracted from the reward of each step that touches the wall.
-        seed: Seed of everything random.
-        scene: Where things are.
+        seed: Seed of all random numbers.
+        scene: The wall, and the ranges of starts and goals.
         options: Changes to the algorithm's `HYPERPARAMETERS`.
 
     Raises:
@@ -97,7 +97,7 @@ class ExpertSettings:
         scene_changes: dict[str, Any] | None = None,
         options: dict[str, Any] | None = None,
     ) -> ExpertSettings:
-        """Settings with defaults for what is None; `scene_changes` are arguments of `FetchScene`.
+        """Makes settings, with defaults for arguments that are None. `scene_changes` are arguments of `FetchScene`.
 
         Raises:
             ValueError: If one of them breaks its rule.
@@ -113,7 +113,7 @@ class ExpertSettings:
 
     @classmethod
     def from_plain(cls, content: dict[str, Any]) -> ExpertSettings:
-        """Settings from what `plain` gave."""
+        """Makes settings from the content of `plain`."""
         unknown = sorted(set(content) ^ {each.name for each in fields(cls)})
         if unknown:
             raise ValueError(f"settings are missing or unknown: {', '.join(unknown)}")
@@ -129,25 +129,25 @@ class ExpertSettings:
 
     @property
     def hyperparameters(self) -> dict[str, Any]:
-        """Those of the algorithm with the options' changes."""
+        """The hyperparameters of the algorithm, with the changes of `options`."""
         return {**HYPERPARAMETERS[self.algo], **self.options}
 
     @property
     def rollout_steps(self) -> int:
-        """Environment steps between trainings; the number of steps of a training is a multiple."""
+        """Environment steps between updates. The total number of steps is a multiple of it."""
         parameters = self.hyperparameters
         if self.algo == "ppo":
             return parameters["n_envs"] * parameters["n_steps"]
         return parameters["train_freq"]
 
     def difference(self, other: ExpertSettings) -> str | None:
-        """The first setting in which the other's value is another one; None if there is none."""
+        """The name of the first setting with another value in `other`; None if all are equal."""
         mine, others = self.plain, other.plain
         return next((name for name in mine if mine[name] != others[name]), None)
 
 
 def to_plain(content: dict[str, Any]) -> dict[str, Any]:
-    """The content as it is after it was written as JSON: with lists instead of tuples."""
+    """The content after a round trip through JSON, with lists instead of tuples."""
     return json.loads(json.dumps(content))
 
 
@@ -159,7 +159,7 @@ def _check_option(algo: str, name: str, value: Any) -> None:
         rule = "a list of positive sizes"
         holds = isinstance(value, list) and len(value) > 0 and all(_is_count(size) for size in value)
     elif isinstance(known[name], int):
-        # Before the first episode has ended there is nothing to learn from, and the buffer must hold one.
+        # Training can start only after the first episode, and the buffer must hold a whole episode.
         least = EPISODE_STEPS if name in ("learning_starts", "buffer_size") else 1
         rule, holds = f"a whole number and at least {least}", _is_count(value) and value >= least
     else:

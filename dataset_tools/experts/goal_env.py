@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The Fetch tasks as reinforcement learning sees them: small displacements, goals, and a reward for their distance."""
+"""The Fetch tasks for reinforcement learning: small displacements as actions, goals, and a reward for their distance."""
 
 from __future__ import annotations
 
@@ -16,42 +16,43 @@ from lerobot_pf2mp.envs.fetch.fetch_scene import SUCCESS_RADIUS, WORKSPACE
 from lerobot_pf2mp.envs.tasks import FETCH_STEPS
 
 EPISODE_STEPS = FETCH_STEPS
-# Of the gripper [m]. Where it turns, it overshoots by up to 0.4 mm, and steps beyond 0.03 m, `MAX_STEP` of the policies'
-# environment, are too long for a demonstration.
+# Largest step of the gripper [m]. Where it turns, it overshoots by up to 0.4 mm, and steps above 0.03 m, `MAX_STEP` of
+# `FetchEnv`, are too long for a demonstration.
 LARGEST_STEP = 0.028
 REWARDS = ("sparse", "dense")
-_DT = 0.04  # of a step [s]
+_DT = 0.04  # duration of a step [s]
 
 Observation = dict[str, np.ndarray]
 
 
 class FetchGoalEnv(gym.Env):
-    """`FetchEnv` with the interface of goal-based environments, as hindsight experience replay wants it.
+    """`FetchEnv` with the interface of goal-based environments, which hindsight experience replay needs.
 
     ## Action space
-    ``Box(-1, 1, (3,))``: the displacement of the gripper in units of `LARGEST_STEP` [m]. One that is longer than 1 is cut
-    to that length.
+    ``Box(-1, 1, (3,))``: the displacement of the gripper in units of `LARGEST_STEP` [m]. A longer one is
+    shortened to length 1.
 
     ## Observation space
-    ``Dict`` of ``observation``, ``achieved_goal`` ``(3,)`` and ``desired_goal`` ``(3,)`` [m], float32. What is achieved is
-    the gripper's position for Reach, the block's for Push. ``observation`` is, x, y, z each, for Reach ``(6,)`` the
-    gripper's position [m] and velocity [m/s], for Push ``(15,)`` the positions of gripper and block [m], block minus
-    gripper [m], and their velocities [m/s]. Velocities are finite differences over a step, 0 at the start.
+    ``Dict`` of ``observation``, ``achieved_goal`` ``(3,)`` and ``desired_goal`` ``(3,)`` [m], float32. The achieved
+    goal is the gripper's position for Reach, the block's for Push. ``observation`` is for Reach ``(6,)`` the gripper's
+    position [m] and velocity [m/s]; for Push ``(15,)`` the positions of gripper and block [m], block minus gripper [m], and
+    their velocities [m/s]; x, y, z each. Velocities are finite differences over a step, 0 at the start.
 
     ## Rewards
-    sparse: 0 within 0.05 m of the goal, -1 elsewhere. dense: minus the distance [m]. From both `collision_penalty` is
-    subtracted in each step that touches the wall.
+    sparse: 0 within 0.05 m of the goal, -1 elsewhere. dense: minus the distance [m]. In each step that touches the wall,
+    `collision_penalty` is subtracted from both.
 
     ## Information
-    That of `FetchEnv`, and ``is_touching``: something has touched the wall in this step.
+    That of `FetchEnv`, and ``is_touching``: the robot or the block has touched the wall in this step.
 
     ## Episode end
-    Never: `make_goal_env` adds the time limit. With the wall in the way, the robot is stopped and may go on.
+    Never: `make_goal_env` adds the time limit. The wall stops the robot, but the episode continues.
 
     Args:
-        env: The environment, with one inner step an action.
+        env: The environment, with one inner step for each action.
         reward: One of `REWARDS`.
-        collision_penalty: For each step that touches the wall; 0 as in the paper, where the wall merely blocks.
+        collision_penalty: Penalty for each step that touches the wall. 0 as in the paper, where the wall only stops the
+            robot.
 
     Raises:
         ValueError: If there is no such reward, or the penalty is negative.
@@ -65,7 +66,7 @@ class FetchGoalEnv(gym.Env):
         self._is_sparse = reward == "sparse"
         self._collision_penalty = collision_penalty
         self.observation_space, self.action_space = goal_spaces(env.scene.has_block)
-        self.seen: Observation = {}  # what FetchEnv showed last
+        self.seen: Observation = {}  # the last observation of FetchEnv
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -76,7 +77,7 @@ class FetchGoalEnv(gym.Env):
         return self._observation(self.seen), {**info, "is_touching": False}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Moves the gripper by ``(3,)`` a displacement [`LARGEST_STEP`]."""
+        """Moves the gripper by a displacement ``(3,)`` [`LARGEST_STEP`]."""
         displacement = np.asarray(action, dtype=np.float64)
         displacement = LARGEST_STEP * displacement / max(1.0, math.hypot(*displacement))
         before = self.seen
@@ -92,13 +93,12 @@ class FetchGoalEnv(gym.Env):
         desired_goal: np.ndarray,
         info: dict[str, Any] | Sequence[dict[str, Any]],
     ) -> np.ndarray:
-        """The reward ``(...)`` of having achieved something.
+        """The reward ``(...)`` of achieved goals.
 
         Args:
             achieved_goal: ``(..., 3)`` [m].
             desired_goal: ``(..., 3)`` [m].
-            info: The step's information, or one for each of ``(B, 3)`` goals. Where it lacks ``is_touching`` there is no
-                penalty.
+            info: The step's information, or one for each of ``(B, 3)`` goals. Without ``is_touching`` there is no penalty.
         """
         distance = np.linalg.norm(np.subtract(achieved_goal, desired_goal, dtype=np.float64), axis=-1)
         reward = -(distance >= SUCCESS_RADIUS).astype(np.float64) if self._is_sparse else -distance
@@ -113,38 +113,38 @@ class FetchGoalEnv(gym.Env):
         self._env.close()
 
     def _observation(self, before: Observation) -> Observation:
-        grip, places = self.seen["agent_pos"], self.seen["environment_state"]
+        grip, environment_state = self.seen["agent_pos"], self.seen["environment_state"]
         grip_velocity = (grip - before["agent_pos"]) / _DT
         if not self._env.scene.has_block:
             parts, achieved = [grip, grip_velocity], grip
         else:
-            block = places[:3]
+            block = environment_state[:3]
             block_velocity = (block - before["environment_state"][:3]) / _DT
             parts, achieved = [grip, block, block - grip, grip_velocity, block_velocity], block
         return {
             "observation": np.concatenate(parts).astype(np.float32),
             "achieved_goal": achieved.copy(),
-            "desired_goal": places[-3:].copy(),
+            "desired_goal": environment_state[-3:].copy(),
         }
 
 
 def make_goal_env(
     task: str, scene_changes: dict[str, Any], reward: str, collision_penalty: float = 0.0
 ) -> gym.Env:
-    """`FetchGoalEnv` with episodes of `EPISODE_STEPS` steps.
+    """Makes a `FetchGoalEnv` with episodes of `EPISODE_STEPS` steps.
 
     Args:
         task: reach or push.
-        scene_changes: Arguments of `FetchScene` that differ from the task's; None for those that do not.
+        scene_changes: Arguments of `FetchScene` that replace those of the task; None keeps the value of the task.
         reward: One of `REWARDS`.
-        collision_penalty: For each step that touches the wall.
+        collision_penalty: Penalty for each step that touches the wall.
     """
     env = FetchGoalEnv(FetchEnv(task, **scene_changes), reward, collision_penalty)
     return gym.wrappers.TimeLimit(env, EPISODE_STEPS)
 
 
 def goal_spaces(has_block: bool) -> tuple[spaces.Dict, spaces.Box]:
-    """Observation and action space of `FetchGoalEnv`."""
+    """The observation and action space of `FetchGoalEnv`."""
     sizes = {"observation": 15 if has_block else 6, "achieved_goal": 3, "desired_goal": 3}
     observation_space = spaces.Dict(
         {name: spaces.Box(-np.inf, np.inf, (size,), dtype=np.float32) for name, size in sizes.items()}
@@ -153,7 +153,7 @@ def goal_spaces(has_block: bool) -> tuple[spaces.Dict, spaces.Box]:
 
 
 def observation_units(has_block: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Centre and scale ``(D,)`` that bring each entry of ``observation`` to about -1 to 1: (x - centre) / scale."""
+    """Centre and unit ``(D,)`` such that (x - centre) / unit is about -1 to 1 for each entry of ``observation``."""
     middle, half = np.asarray(WORKSPACE.centre), np.asarray(WORKSPACE.size) / 2
     still, fast = np.zeros(3), np.full(3, LARGEST_STEP / _DT)
     if not has_block:

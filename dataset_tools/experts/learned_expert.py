@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An expert for Fetch behind a wall that was trained by reinforcement learning."""
+"""An expert for Fetch with a wall that was trained by reinforcement learning."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ import numpy as np
 from lerobot_pf2mp.dataset_tools.experts.expert_checkpoint import ExpertCheckpoint
 from lerobot_pf2mp.dataset_tools.experts.expert_settings import to_plain
 from lerobot_pf2mp.dataset_tools.experts.goal_env import EPISODE_STEPS, FetchGoalEnv
-from lerobot_pf2mp.dataset_tools.fetch.fetch_expert import Recording
+from lerobot_pf2mp.dataset_tools.experts.recording import Recording
 from lerobot_pf2mp.envs.fetch.fetch_env import FetchEnv
 from lerobot_pf2mp.envs.fetch.fetch_scene import FetchScene
 
 
 class LearnedFetchExpert:
-    """Acts as the policy in a folder written by `train_expert` finds best, without noise.
+    """Takes the deterministic actions, without noise, of a policy that `train_expert` wrote.
 
     Args:
-        env: The environment, of the scene that the expert was trained in.
+        env: The environment, with the scene in which the expert was trained.
         folder: The expert's folder.
-        seed: Seed of all demonstrations; each has its own, so that they do not depend on each other.
+        seed: Seed of all demonstrations. Each demonstration has its own random numbers, so they do not depend on each
+            other.
 
     Raises:
         ImportError: If Stable-Baselines3 is missing.
@@ -39,7 +40,7 @@ class LearnedFetchExpert:
         self._seed = seed
 
     def demonstrate(self, number: int) -> Recording:
-        """One episode; `number` seeds it."""
+        """Demonstrates one episode; `number` is part of its seed."""
         layout = self._env.scene.sample(np.random.default_rng([self._seed, number]))
         observation, info = self._goal_env.reset(
             options={"start": layout.start, "goal": layout.goal, "block": layout.block}

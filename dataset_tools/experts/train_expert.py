@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trains experts for the Fetch tasks by reinforcement learning, the paper's way of making demonstrations."""
+"""Trains experts for the Fetch tasks by reinforcement learning. The paper makes its demonstrations with such experts."""
 
 from __future__ import annotations
 
@@ -30,22 +30,22 @@ def train_expert(
     device: str = "cpu",
     **settings: Any,
 ) -> ExpertCheckpoint:
-    """Trains an expert, or goes on with one that has been trained for fewer steps.
+    """Trains an expert, or continues the training of one with fewer steps.
 
-    Interrupted and called again, it goes on from the last checkpoint, with a new episode and other random numbers than
-    without the interruption.
+    After an interruption, the same call continues from the last checkpoint. It then begins a new episode, and its random
+    numbers differ from those of a training without the interruption.
 
     Args:
         task: reach or push.
-        algo: ppo or sac_her; None is ppo for reach, sac_her for push.
-        total_steps: Environment steps in all, rounded up to whole rollouts of the algorithm.
+        algo: ppo or sac_her; None means ppo for reach, sac_her for push.
+        total_steps: Environment steps in total, rounded up to whole rollouts of the algorithm.
         output_dir: The expert's folder, see `expert_checkpoint`.
-        save_freq: Environment steps between checkpoints, rounded up likewise.
-        device: Where the networks are trained, cpu or cuda.
-        **settings: For `ExpertSettings.of`: reward, collision_penalty, seed, scene_changes, options.
+        save_freq: Environment steps between checkpoints, rounded up in the same way.
+        device: Device on which the networks are trained, cpu or cuda.
+        **settings: Arguments of `ExpertSettings.of`: reward, collision_penalty, seed, scene_changes, options.
 
     Returns:
-        The expert as written.
+        The expert that was written.
 
     Raises:
         ImportError: If Stable-Baselines3 is missing.
@@ -65,7 +65,7 @@ def train_expert(
 
     algorithm = make_algorithm(wanted, device)
     try:
-        output_dir.mkdir(parents=True, exist_ok=True)  # if it cannot be made, that shows now
+        output_dir.mkdir(parents=True, exist_ok=True)  # fails before the training, not after it
         if checkpoint is not None:
             checkpoint.load_into(algorithm)
         return _train(algorithm, wanted, total_steps, output_dir, save_freq)
@@ -75,8 +75,8 @@ def train_expert(
 
 def _found(folder: Path, wanted: ExpertSettings) -> ExpertCheckpoint | None:
     if not (folder / EXPERT_FILE).exists():
-        # A call that is killed before its first checkpoint is whole leaves nothing but that one's arrays. They may be
-        # complete, as the settings come last, but without these nothing can go on from them.
+        # A call that was killed during its first checkpoint leaves only the arrays. They may be complete, as the settings
+        # are written last. But without settings the training cannot continue from them.
         if folder.exists() and any(not path.name.startswith((".", "steps_")) for path in folder.iterdir()):
             raise FileExistsError(
                 f"{folder} is no expert's folder, it holds no {EXPERT_FILE}: choose another --output_dir"
@@ -87,7 +87,7 @@ def _found(folder: Path, wanted: ExpertSettings) -> ExpertCheckpoint | None:
     if name is not None:
         raise ValueError(
             f"{folder} holds an expert with another {name}, {checkpoint.settings.plain[name]} instead of "
-            f"{wanted.plain[name]}: choose another --output_dir, or the same settings to go on with its training"
+            f"{wanted.plain[name]}: choose another --output_dir, or the same settings to continue its training"
         )
     return checkpoint
 
@@ -116,7 +116,7 @@ def _train(
 
 
 def _begin_new_episode(algorithm: BaseAlgorithm, seed: int) -> None:
-    """Draws other random numbers than before, and ends the episode that was under way."""
+    """Sets a new seed for the random numbers, and ends the current episode."""
     algorithm.set_random_seed(
         int(np.random.SeedSequence([seed, algorithm.num_timesteps]).generate_state(1)[0])
     )

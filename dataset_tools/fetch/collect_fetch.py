@@ -15,17 +15,18 @@ import numpy as np
 
 from lerobot_pf2mp.dataset_tools.experts.expert_checkpoint import ExpertCheckpoint
 from lerobot_pf2mp.dataset_tools.experts.learned_expert import LearnedFetchExpert, check_scene
+from lerobot_pf2mp.dataset_tools.experts.recording import Recording
 from lerobot_pf2mp.dataset_tools.fetch.fetch_dataset import fetch_spec
-from lerobot_pf2mp.dataset_tools.fetch.fetch_expert import STYLES, Recording, ScriptedFetchExpert
+from lerobot_pf2mp.dataset_tools.fetch.fetch_expert import STYLES, ScriptedFetchExpert
 from lerobot_pf2mp.dataset_tools.writing.attempts import successful
 from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory, resample
 from lerobot_pf2mp.dataset_tools.writing.write_trajectories import write_trajectories
 from lerobot_pf2mp.envs.fetch.fetch_env import MAX_STEP, FetchEnv
 from lerobot_pf2mp.envs.fetch.fetch_scene import make_scene
-from lerobot_pf2mp.envs.image_size import picture_size_of
+from lerobot_pf2mp.envs.image_size import image_size_of
 from lerobot_pf2mp.process.worker_pool import worker_pool
 
-_CHUNK = 16  # demonstrations that a process makes in one go
+_CHUNK = 16  # demonstrations that a process makes in one call
 
 
 def collect_fetch(
@@ -41,7 +42,7 @@ def collect_fetch(
     n_processes: int,
     overwrite: bool,
     expert: Path | None = None,
-    picture_width: int | None = None,
+    image_width: int | None = None,
 ) -> tuple[int, Counter[str]]:
     """Collects successful, collision-free demonstrations of an expert as a LeRobotDataset.
 
@@ -53,14 +54,14 @@ def collect_fetch(
         repo_id: Its name, ``user/name``.
         n_episodes: Demonstrations to write.
         n_steps: Steps that each is resampled to.
-        style: How near the scripted expert comes to the wall, clear or hug.
-        scene_changes: Arguments of `FetchScene` that differ from the task's; None for those that do not.
-        seed: Seed of everything random.
-        n_processes: Processes side by side; 1 is this one.
-        overwrite: Whether a dataset already there is replaced.
-        expert: Folder of an expert that `train_expert` wrote; None is the scripted one.
-        picture_width: Width of a camera's pictures [pixels], their height is three quarters of it, which are recorded
-            instead of the places of block and goal; None for no camera.
+        style: Distance of the scripted expert to the wall: ``clear`` (2 to 5 cm) or ``hug`` (2 to 10 mm).
+        scene_changes: Arguments of `FetchScene` that replace those of the task; None keeps the value of the task.
+        seed: Seed of all random numbers.
+        n_processes: Number of parallel processes; with 1 the demonstrations are made in this process.
+        overwrite: Whether an existing dataset is replaced.
+        expert: Folder of an expert that `train_expert` wrote; None uses the scripted expert.
+        image_width: Width of a camera's images [pixels]; their height is three quarters of it. The images are recorded
+            instead of the positions of block and goal. None for no camera.
 
     Returns:
         The number of episodes written, and the number of those left out, by reason.
@@ -87,18 +88,18 @@ def collect_fetch(
         origin = f"{checkpoint.description} moved it (seed {seed})."
     failed: Counter[str] = Counter()
     options: dict[str, Any] = dict(scene_changes)
-    picture_size = None
-    if picture_width is not None:
-        options |= {"render_mode": "rgb_array", "render_size": picture_width}
-        picture_size = picture_size_of(picture_width)
+    image_size = None
+    if image_width is not None:
+        options |= {"render_mode": "rgb_array", "render_size": image_width}
+        image_size = image_size_of(image_width)
     with _demonstrations(n_processes, task, options, style, seed, expert) as recordings:
         attempts = (_attempt(recording, n_steps) for recording in recordings)
         n_written, dropped = write_trajectories(
             successful(attempts, failed),
             root=root,
-            spec=fetch_spec(task, repo_id, origin, n_steps, picture_size),
+            spec=fetch_spec(task, repo_id, origin, n_steps, image_size),
             n_steps=n_steps,
-            collides=lambda way: False,  # contact was looked for in every physics step
+            collides=lambda _: False,  # the environment checks contact in every physics step
             n_episodes=n_episodes,
             overwrite=overwrite,
         )
@@ -119,7 +120,7 @@ def _demonstrations(
 
 
 def _side_by_side(pool: ProcessPoolExecutor, n_processes: int) -> Iterator[Recording]:
-    """All demonstrations in their order, a few chunks ahead of the one that is asked for."""
+    """All demonstrations in their order. A few chunks are computed ahead."""
     ahead = [pool.submit(_work, chunk) for chunk in range(n_processes + 1)]
     for chunk in count(len(ahead)):
         ahead.append(pool.submit(_work, chunk))
@@ -134,8 +135,8 @@ def _attempt(recording: Recording, n_steps: int) -> Trajectory | str:
     if _largest_step(recording, n_steps) > MAX_STEP:
         return f"too long to be repeated in {n_steps} steps"
     objects = np.array(recording.blocks) if recording.blocks else None
-    pictures = np.array(recording.pictures) if recording.pictures else None
-    return Trajectory(np.array(recording.grips), recording.goal, objects, pictures)
+    images = np.array(recording.images) if recording.images else None
+    return Trajectory(np.array(recording.grips), recording.goal, objects, images)
 
 
 def _largest_step(recording: Recording, n_steps: int) -> float:

@@ -1,20 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Converts transitions of gymnasium-robotics' FetchReach and FetchPush that were recorded elsewhere.
 
-Read are the folders of Minari datasets whose observations hold ``observation``, ``desired_goal`` and ``achieved_goal``, and
-npz files without pickles that hold E whole episodes of one length, or N rows of all episodes one after the other:
+The source is the folder of a Minari dataset whose observations hold ``observation``, ``desired_goal`` and
+``achieved_goal``, or an npz file without pickles. An npz file holds E whole episodes of equal length, or N rows of all
+episodes one after the other:
 
 | array           | episodes               | rows      |                                                                 |
 |-----------------|------------------------|-----------|-----------------------------------------------------------------|
 | `observation`   | ``(E, T + 1, W)``      | ``(N, W)``| W = 10 for Reach, 25 for Push                                   |
 | `desired_goal`  | ``(E, T or T + 1, 3)`` | ``(N, 3)``| [m]; an episode's last is its goal                              |
-| `achieved_goal` | ``(E, T + 1, 3)``      | ``(N, 3)``| optional, for a check: where `observation` has gripper or block |
+| `achieved_goal` | ``(E, T + 1, 3)``      | ``(N, 3)``| optional, as a check: position of gripper or block              |
 | `episode_ends`  |                        | ``(E,)``  | the row after each episode's last, the last of them N; or       |
 | `terminals`     |                        | ``(N,)``  | true in an episode's last row,                                  |
-| `timeouts`      |                        | ``(N,)``  | likewise; one of the two or both                                |
+| `timeouts`      |                        | ``(N,)``  | the same; one of the two or both                                |
 
-Columns 0 to 2 of an observation are the gripper's position, for Push 3 to 5 the block's [m]; nothing else of it is used.
-In the original environments the gripper starts at y = 0.75 m, where this package's wall stands unless it is moved.
+Columns 0 to 2 of an observation are the gripper's position [m]. For Push, columns 3 to 5 are the block's position [m].
+Other columns are not used. In the original environments the gripper starts at y = 0.75 m, inside the default wall of this
+package.
 """
 
 from __future__ import annotations
@@ -39,10 +41,10 @@ from lerobot_pf2mp.envs.fetch.fetch_scene import BLOCK_SIZE, SUCCESS_RADIUS, WOR
 _WIDTHS = {"reach": 10, "push": 25}
 _COLUMNS = ("observation", "desired_goal", "achieved_goal")
 _FLAGS = ("terminals", "timeouts")
-# Generous: what lies outside is of another robot, or in another unit.
-_REACH = Box.between(WORKSPACE.low - 0.75, WORKSPACE.high + 0.75)
-_SAME_PLACE = 1e-3  # [m]
-# Wide enough however the block is turned on the table.
+# Wide limits: positions outside them are from another robot or in another unit.
+_LIMITS = Box.between(WORKSPACE.low - 0.75, WORKSPACE.high + 0.75)
+_SAME_POSITION = 1e-3  # largest distance between equal positions [m]
+# A box around the block for every rotation on the table.
 _BLOCK = Box((0, 0, 0), (BLOCK_SIZE * math.sqrt(2), BLOCK_SIZE * math.sqrt(2), BLOCK_SIZE))
 
 
@@ -59,19 +61,19 @@ def convert_fetch(
 ) -> tuple[int, Counter[str]]:
     """Writes the episodes of a recording that reach their goal without touching the wall as a LeRobotDataset.
 
-    Hand, fingers and block must not touch the wall on the straight ways between resampled positions. The rest of the arm
-    is not looked at, as recordings do not tell where it was, and the block counts as wide as it is when turned by 45
-    degrees.
+    Hand, fingers and block must not touch the wall on the straight lines between resampled positions. The rest of the arm
+    is not checked, because recordings do not contain its positions. The block is checked with its width at a rotation of
+    45 degrees.
 
     Args:
-        path: An npz file or the folder of a Minari dataset; see the module for their layouts.
+        path: An npz file or the folder of a Minari dataset; see the module docstring for the layouts.
         task: reach or push.
         root: The dataset's folder.
         repo_id: Its name, ``user/name``.
         n_steps: Steps T that each episode is resampled to.
-        scene_changes: Arguments of `FetchScene` that differ from the task's; None for those that do not.
-        n_episodes: Most episodes to write; None writes all.
-        overwrite: Whether a dataset already there is replaced.
+        scene_changes: Arguments of `FetchScene` that replace those of the task; None keeps the value of the task.
+        n_episodes: Largest number of episodes to write; None writes all.
+        overwrite: Whether an existing dataset is replaced.
 
     Returns:
         The number of episodes written, and the number of those left out, by reason.
@@ -79,7 +81,7 @@ def convert_fetch(
     Raises:
         FileNotFoundError: If there is no such file or folder.
         FileExistsError: If `root` exists and `overwrite` is false.
-        ValueError: If an argument breaks its rule, the recording is of another layout, robot or unit or holds NaN or
+        ValueError: If an argument breaks its rule, the recording has another layout, robot or unit, or holds NaN or
             infinity, or no episode is usable.
     """
     scene = make_scene(task, **scene_changes)
@@ -90,7 +92,7 @@ def convert_fetch(
         root=root,
         spec=fetch_spec(task, repo_id, f"Converted from {Path(path).name} (fetch).", n_steps),
         n_steps=n_steps,
-        collides=lambda way: False,  # has been looked at, with the block
+        collides=lambda _: False,  # already checked by _usable, with the block
         n_episodes=n_episodes,
         n_expected=n_recorded,
         overwrite=overwrite,
@@ -99,10 +101,10 @@ def convert_fetch(
 
 
 def read_fetch(path: Path, task: str) -> tuple[int, Iterator[Trajectory]]:
-    """The episodes of a recording, with the last desired goal of each as its goal.
+    """Reads the episodes of a recording. The goal of each is its last desired goal.
 
     Args:
-        path: An npz file or the folder of a Minari dataset; see the module for their layouts.
+        path: An npz file or the folder of a Minari dataset; see the module docstring for the layouts.
         task: reach or push.
 
     Returns:
@@ -110,11 +112,11 @@ def read_fetch(path: Path, task: str) -> tuple[int, Iterator[Trajectory]]:
 
     Raises:
         FileNotFoundError: If there is no such file or folder.
-        ValueError: If it is of another layout, or, when an episode is asked for, if that is of another layout, robot or
-            unit or holds NaN or infinity.
+        ValueError: If it has another layout. When an episode is read: if that has another layout, robot or unit, or holds
+            NaN or infinity.
     """
-    place = Path(path).expanduser()
-    n_episodes, episodes = _read_minari(place) if place.is_dir() else _read_npz(place)
+    source = Path(path).expanduser()
+    n_episodes, episodes = _read_minari(source) if source.is_dir() else _read_npz(source)
     return n_episodes, (
         _trajectory(episode, task, f"episode {number} of {path}") for number, episode in enumerate(episodes)
     )
@@ -140,11 +142,11 @@ def _usable(
 
 
 def _fault(trajectory: Trajectory, scene: FetchScene, n_steps: int) -> str | None:
-    """Why an episode is left out; None if it is not."""
+    """The reason why an episode is left out; None if it is usable."""
     if trajectory.n_steps < MIN_STEPS:
         return f"shorter than {MIN_STEPS} steps"
-    way = resample(trajectory.positions, n_steps)
-    if any(scene.hits_wall(a, b) for a, b in itertools.pairwise(way)):
+    positions = resample(trajectory.positions, n_steps)
+    if any(scene.hits_wall(a, b) for a, b in itertools.pairwise(positions)):
         return "in collision"
     if trajectory.objects is not None:
         wall = scene.wall.grown_by(_BLOCK)
@@ -203,7 +205,7 @@ def _load(path: Path) -> dict[str, np.ndarray]:
 
 
 def _ends(arrays: dict[str, np.ndarray], n: int, path: Path) -> np.ndarray:
-    """The row after each episode's last; what follows the last mark is an episode too."""
+    """The row after each episode's last row. Rows after the last mark are an episode too."""
     if "episode_ends" in arrays:
         ends = arrays["episode_ends"]
         is_right = ends.ndim == 1 and ends.dtype.kind in "iu" and len(ends) > 0
@@ -263,22 +265,22 @@ def _trajectory(episode: dict[str, np.ndarray], task: str, what: str) -> Traject
     for name, values in (("observation", grips), ("observation", moved), ("desired_goal", goals)):
         if not np.isfinite(values).all():
             raise ValueError(f"positions and goals must be finite, got NaN or infinity in {name} of {what}")
-    _check_reach(np.concatenate([grips, goals, moved[:1]]), what)
+    _check_limits(np.concatenate([grips, goals, moved[:1]]), what)
     if "achieved_goal" in episode:
         _check_achieved(episode["achieved_goal"], moved, task, what)
     return Trajectory(grips, goals[-1], blocks if task == "push" else None)
 
 
-def _check_reach(places: np.ndarray, what: str) -> None:
-    low, high = places.min(axis=0), places.max(axis=0)
-    if np.any(low < _REACH.low) or np.any(high > _REACH.high):
+def _check_limits(positions: np.ndarray, what: str) -> None:
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    if np.any(low < _LIMITS.low) or np.any(high > _LIMITS.high):
         found, expected = (
             f"{np.round(ends[0], 3).tolist()} to {np.round(ends[1], 3).tolist()}"
-            for ends in ((low, high), (_REACH.low, _REACH.high))
+            for ends in ((low, high), (_LIMITS.low, _LIMITS.high))
         )
         raise ValueError(
             f"gripper, block and goal must be about where Fetch can reach, x, y, z from {expected} m, got {found} in "
-            f"{what}: of another robot, or not in metres?"
+            f"{what}: is it from another robot, or not in metres?"
         )
 
 
@@ -286,7 +288,7 @@ def _check_achieved(achieved: np.ndarray, moved: np.ndarray, task: str, what: st
     if achieved.shape != moved.shape:
         raise ValueError(f"achieved_goal must have shape {moved.shape}, got {achieved.shape} in {what}")
     # Also false if a distance is not a number.
-    if not np.all(np.abs(achieved - moved) < _SAME_PLACE):
+    if not np.all(np.abs(achieved - moved) < _SAME_POSITION):
         columns, mover = ("3 to 5", "block") if task == "push" else ("0 to 2", "gripper")
         raise ValueError(
             f"achieved_goal must be the {mover}'s position, columns {columns} of observation, got another in {what}"

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all Fetch datasets have in common: features and card."""
+"""The common parts of all Fetch datasets: features and card."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from lerobot_pf2mp.dataset_tools.writing.episodes import PICTURES
-from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, picture_feature
+from lerobot_pf2mp.dataset_tools.writing.episodes import IMAGE_KEY
+from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, image_feature
 
 FPS = 25
 TASK_DESCRIPTIONS = {
@@ -15,7 +15,7 @@ TASK_DESCRIPTIONS = {
 }
 
 _XYZ = ["x", "y", "z"]
-_PLACES = {"reach": ["goal"], "push": ["block", "goal"]}
+_OBJECTS = {"reach": ["goal"], "push": ["block", "goal"]}
 
 _CARD = """\
 ---
@@ -32,7 +32,7 @@ Every demonstration is resampled to {n_steps} steps by linear interpolation in t
 | feature | meaning | unit |
 |---|---|---|
 | `observation.state` | position x, y, z of the gripper | m |
-| `observation.environment_state` | positions x, y, z of {places}, unless there is a camera | m |
+| `observation.environment_state` | positions x, y, z of {objects}, unless there is a camera | m |
 | `action` | next position x, y, z of the gripper | m |
 | `observation.image` | if present: the scene, from in front of the table | |
 
@@ -41,33 +41,34 @@ x points away from the robot, y to its left, z up; the table's top is at z = 0.4
 
 
 def fetch_spec(
-    task: str, repo_id: str, origin: str, n_steps: int, picture_size: tuple[int, int] | None = None
+    task: str, repo_id: str, origin: str, n_steps: int, image_size: tuple[int, int] | None = None
 ) -> DatasetSpec:
-    """What a Fetch dataset holds besides its episodes.
+    """The metadata of a Fetch dataset.
 
     Args:
         task: reach or push.
         repo_id: The dataset's name, ``user/name``.
-        origin: A sentence for the card: where the demonstrations come from.
+        origin: A sentence for the card about the source of the demonstrations.
         n_steps: Steps that each is resampled to.
-        picture_size: Height and width of the pictures that are recorded instead of places [pixels]; None for places.
+        image_size: Height and width of the images that are recorded instead of positions of block and goal [pixels]; None
+            records the positions.
     """
     description = TASK_DESCRIPTIONS[task]
-    places = " and ".join(_PLACES[task])
+    objects = " and ".join(_OBJECTS[task])
     card = _CARD.format(
-        title=repo_id, description=description, origin=origin, n_steps=n_steps, fps=FPS, places=places
+        title=repo_id, description=description, origin=origin, n_steps=n_steps, fps=FPS, objects=objects
     )
     features = _features_of(task)
-    if picture_size is not None:
+    if image_size is not None:
         del features["observation.environment_state"]
-        features[PICTURES] = picture_feature(picture_size)
+        features[IMAGE_KEY] = image_feature(image_size)
     return DatasetSpec(repo_id, FPS, features, description, card)
 
 
 def _features_of(task: str) -> dict[str, dict[str, Any]]:
-    places = [f"{place}_{axis}" for place in _PLACES[task] for axis in _XYZ]
+    names = [f"{name}_{axis}" for name in _OBJECTS[task] for axis in _XYZ]
     return {
         "observation.state": {"dtype": "float32", "shape": (3,), "names": _XYZ},
-        "observation.environment_state": {"dtype": "float32", "shape": (len(places),), "names": places},
+        "observation.environment_state": {"dtype": "float32", "shape": (len(names),), "names": names},
         "action": {"dtype": "float32", "shape": (3,), "names": _XYZ},
     }

@@ -1,71 +1,39 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scripted expert for Fetch behind a wall: it moves past the wall, and pushes the block along a free line."""
+"""A scripted expert for Fetch with a wall. It moves past the wall and pushes the block along a free line."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
+from lerobot_pf2mp.dataset_tools.experts.recording import Recording
 from lerobot_pf2mp.dataset_tools.fetch.fetch_routes import routes, walk
 from lerobot_pf2mp.envs.box import Box
 from lerobot_pf2mp.envs.fetch.fetch_env import FetchEnv
 from lerobot_pf2mp.envs.fetch.fetch_scene import BLOCK_SIZE, FINGERS, HAND, WORKSPACE
 
-# How far hand and fingers stay away from the wall [m], drawn anew for each demonstration.
+# Range of the distance that hand and fingers keep to the wall [m]. It is drawn for each demonstration.
 STYLES = {"clear": (0.02, 0.05), "hug": (0.002, 0.010)}
 
-_SPEED = (0.014, 0.022)  # [m] for each step of 0.04 s, drawn likewise
-_PUSH_SPEED = 0.012  # [m] for each step
-_BEHIND = 0.070  # of the gripper behind the block's centre before it pushes [m]
-_PUSH_HEIGHT = 0.425  # of the gripper [m]
-_BLOCK_MARGIN = 0.01  # between fingers and block on the way to it [m]
-_ARRIVED = 0.01  # [m]
+_SPEED = (0.014, 0.022)  # range of the speed, drawn for each demonstration [m per step of 0.04 s]
+_PUSH_SPEED = 0.012  # [m per step]
+_BEHIND = 0.070  # distance of the gripper behind the block's centre before it pushes [m]
+_PUSH_HEIGHT = 0.425  # height of the gripper when it pushes [m]
+_BLOCK_MARGIN = 0.01  # distance between fingers and block while the gripper approaches [m]
+_ARRIVED = 0.01  # within this distance a position counts as reached [m]
 _MAX_STEPS = 120
 
 
-@dataclass
-class Recording:
-    """What was seen in one episode.
-
-    Args:
-        goal: ``(3,)`` [m].
-        grips: ``(3,)`` positions of the gripper, one for each step and one before [m].
-        blocks: The same of the block; empty without one.
-        is_success: Whether the goal was reached at the end.
-        is_collision: Whether something touched the wall.
-        pictures: ``(H, W, 3)`` uint8, one for each position; empty if the environment does not render.
-    """
-
-    goal: np.ndarray
-    grips: list[np.ndarray] = field(default_factory=list)
-    blocks: list[np.ndarray] = field(default_factory=list)
-    is_success: bool = False
-    is_collision: bool = False
-    pictures: list[np.ndarray] = field(default_factory=list)
-
-    def note(
-        self, observation: dict[str, np.ndarray], info: dict[str, Any], picture: np.ndarray | None = None
-    ) -> None:
-        """Adds an observation and what came with it."""
-        if picture is not None:
-            self.pictures.append(picture)
-        self.grips.append(observation["agent_pos"].astype(float))
-        if len(observation["environment_state"]) == 6:
-            self.blocks.append(observation["environment_state"][:3].astype(float))
-        self.is_success, self.is_collision = info["is_success"], info["is_collision"]
-
-
 class ScriptedFetchExpert:
-    """Moves the gripper along the shortest way that keeps a margin to the wall; for Push pushes the block to the goal.
+    """Moves the gripper along the shortest path that keeps a margin to the wall; for Push it pushes the block to the goal.
 
     Args:
         env: The environment.
-        style: How near it comes to the wall, one of `STYLES`: clear keeps away, hug passes close by.
-        seed: Seed of all demonstrations; each has its own, so that they do not depend on each other.
+        style: A key of `STYLES`, the distance to the wall: ``clear`` keeps away from it, ``hug`` passes close to it.
+        seed: Seed of all demonstrations. Each demonstration has its own random numbers, so they do not depend on each
+            other.
 
     Raises:
         ValueError: If there is no such style.
@@ -79,7 +47,7 @@ class ScriptedFetchExpert:
         self._seed = seed
 
     def demonstrate(self, number: int) -> Recording:
-        """One episode; `number` seeds it."""
+        """Demonstrates one episode; `number` is part of its seed."""
         rng = np.random.default_rng([self._seed, number])
         layout = self._env.scene.sample(rng)
         observation, info = self._env.reset(
@@ -97,13 +65,13 @@ class ScriptedFetchExpert:
     def _targets(self, seen: Recording, rng: np.random.Generator) -> Iterator[np.ndarray]:
         margin, speed = rng.uniform(*STYLES[self._style]), rng.uniform(*_SPEED)
         if not seen.blocks:
-            yield from self._go(seen, seen.goal, margin, speed)
+            yield from self._move_to(seen, seen.goal, margin, speed)
             return
         push = _direction(seen.blocks[-1], seen.goal)
         behind = seen.blocks[-1] - _BEHIND * push
         behind[2] = _PUSH_HEIGHT
         block = Box((*seen.blocks[-1].tolist(),), (BLOCK_SIZE,) * 3)
-        yield from self._go(seen, behind, margin, speed, [block])
+        yield from self._move_to(seen, behind, margin, speed, [block])
         if math.dist(seen.grips[-1], behind) > _ARRIVED:
             return
         line = push
@@ -113,27 +81,27 @@ class ScriptedFetchExpert:
             target[2] = _PUSH_HEIGHT
             yield target
 
-    def _go(
+    def _move_to(
         self, seen: Recording, goal: np.ndarray, margin: float, speed: float, others: Sequence[Box] = ()
     ) -> Iterator[np.ndarray]:
-        """Along the shortest way; where start or goal is too near the wall for the margin, with a smaller one."""
+        """Actions along the shortest path. The margin is smaller where start or goal is too near the wall for it."""
         start = seen.grips[-1]
         for share in (1.0, 0.5, 0.25, 0.0):
             boxes = _kept_clear_of(self._env.scene.wall, share * margin)
             for other in others:
                 boxes += _kept_clear_of(other, share * _BLOCK_MARGIN)
-            ways = routes(start, goal, boxes)
-            if ways:
-                yield from walk(ways[0], speed)
+            paths = routes(start, goal, boxes)
+            if paths:
+                yield from walk(paths[0], speed)
                 return
 
 
 def _kept_clear_of(box: Box, margin: float) -> list[Box]:
-    """Where the gripper may not be if hand and fingers are to keep a margin."""
+    """The boxes that the gripper's position must not enter, so that hand and fingers keep a margin to a box."""
     spread = Box((0, 0, 0), (2 * margin,) * 3)
     return [box.grown_by(part).grown_by(spread) for part in (HAND, FINGERS)]
 
 
 def _direction(start: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    way = np.array([*(goal[:2] - start[:2]), 0.0])
-    return way / max(float(np.linalg.norm(way)), 1e-9)
+    offset = np.array([*(goal[:2] - start[:2]), 0.0])
+    return offset / max(float(np.linalg.norm(offset)), 1e-9)

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_pf2mp.dataset_tools.handwriting.handwriting_dataset import handwriting_spec
-from lerobot_pf2mp.dataset_tools.handwriting.handwriting_expert import ScriptedScribe
+from lerobot_pf2mp.dataset_tools.handwriting.handwriting_expert import ScriptedHandwritingExpert
 from lerobot_pf2mp.dataset_tools.writing.attempts import successful
 from lerobot_pf2mp.dataset_tools.writing.write_trajectories import write_trajectories
 from lerobot_pf2mp.envs.handwriting.handwriting_env import HandwritingEnv
-from lerobot_pf2mp.envs.image_size import picture_size_of
+from lerobot_pf2mp.envs.image_size import image_size_of
 
 
 def collect_handwriting(
@@ -26,20 +26,20 @@ def collect_handwriting(
     scene_options: dict[str, Any],
     seed: int,
     overwrite: bool,
-    picture_width: int | None = None,
+    image_width: int | None = None,
 ) -> tuple[int, Counter[str]]:
     """Collects successful, collision-free demonstrations of a scripted expert as a LeRobotDataset.
 
     Args:
-        space: What states and actions are, joint or pen.
+        space: ``joint`` or ``pen``: states and actions are joint positions or positions of the pen's tip.
         root: The dataset's folder.
         repo_id: Its name, ``user/name``.
         n_episodes: Demonstrations to write.
-        n_steps: Steps of each.
+        n_steps: Steps of each demonstration.
         scene_options: Arguments of `make_writing_scene`.
-        seed: Seed of everything random.
-        overwrite: Whether a dataset already there is replaced.
-        picture_width: Width of a camera's pictures [pixels], their height is three quarters of it; None for no camera.
+        seed: Seed of all random numbers.
+        overwrite: Whether an existing dataset is replaced.
+        image_width: Width of a camera's images [pixels]; their height is three quarters of it. None for no camera.
 
     Returns:
         The number of episodes written, and the number of those left out, by reason.
@@ -50,20 +50,20 @@ def collect_handwriting(
     """
     if n_steps < 2:
         raise ValueError(f"n_steps must be at least 2, got {n_steps}")
-    options, picture_size = dict(scene_options), None
-    if picture_width is not None:
-        options |= {"render_mode": "rgb_array", "render_size": picture_width}
-        picture_size = picture_size_of(picture_width)
+    options, image_size = dict(scene_options), None
+    if image_width is not None:
+        options |= {"render_mode": "rgb_array", "render_size": image_width}
+        image_size = image_size_of(image_width)
     env = HandwritingEnv(space, **options)
-    scribe = ScriptedScribe(env, n_steps, seed)
+    writer = ScriptedHandwritingExpert(env, n_steps, seed)
     failed: Counter[str] = Counter()
     origin = f"A scripted expert wrote it (seed {seed})."
     n_written, dropped = write_trajectories(
-        successful((scribe.demonstrate(number) for number in count()), failed),
+        successful((writer.demonstrate(number) for number in count()), failed),
         root=root,
-        spec=handwriting_spec(space, env.scene.name, repo_id, origin, n_steps, picture_size),
+        spec=handwriting_spec(space, env.scene.name, repo_id, origin, n_steps, image_size),
         n_steps=n_steps,
-        collides=lambda way: False,  # it has been drawn in the environment
+        collides=lambda _: False,  # checked when the environment drew it
         n_episodes=n_episodes,
         overwrite=overwrite,
     )

@@ -34,21 +34,21 @@ def convert_handwriting(
     n_episodes: int | None = None,
     overwrite: bool = False,
 ) -> tuple[int, Counter[str]]:
-    """Writes the recorded episodes that keep clear of regions and table as a LeRobotDataset.
+    """Writes the recorded episodes without collision as a LeRobotDataset.
 
-    Joint positions become places of the pen, and places joint positions with the pen upright, where the dataset is to hold
-    the other.
+    If the dataset is to hold positions of the pen and the recording holds joint positions, they are converted by forward
+    kinematics. In the other direction inverse kinematics finds joint positions with the pen upright.
 
     Args:
-        path: Of a recording, see `handwriting_recording`.
-        space: What states and actions are to be, joint or pen.
+        path: A recording, see `handwriting_recording`.
+        space: ``joint`` or ``pen``: states and actions are joint positions or positions of the pen's tip.
         root: The dataset's folder.
         repo_id: Its name, ``user/name``.
         n_steps: Steps T that each episode is resampled to.
         scene_options: Arguments of `make_writing_scene`; its regions must not be entered.
         joint_offsets: Added to the seven joints of the recording [rad].
-        n_episodes: Most episodes to write; None writes all.
-        overwrite: Whether a dataset already there is replaced.
+        n_episodes: Largest number of episodes to write; None writes all.
+        overwrite: Whether an existing dataset is replaced.
 
     Returns:
         The number of episodes written, and the number of those left out, by reason.
@@ -56,8 +56,8 @@ def convert_handwriting(
     Raises:
         FileNotFoundError: If there is no such recording.
         FileExistsError: If `root` exists and `overwrite` is false.
-        ValueError: If an argument breaks its rule, the recording is of another layout or unit, leaves the sheet or the arm's
-            limits, or no episode is usable.
+        ValueError: If an argument breaks its rule, the recording has another layout or unit, or leaves the sheet or the
+            arm's limits, or no episode is usable.
     """
     if n_steps < 2:
         raise ValueError(f"n_steps must be at least 2, got {n_steps}")
@@ -71,7 +71,7 @@ def convert_handwriting(
             space, env.scene.name, repo_id, f"Converted from {path.name} (handwriting).", n_steps
         ),
         n_steps=n_steps,
-        collides=lambda way: False,  # has been looked at
+        collides=lambda _: False,  # already checked by _usable
         n_episodes=n_episodes,
         n_expected=len(recordings),
         overwrite=overwrite,
@@ -89,16 +89,16 @@ def _usable(
 ) -> Iterator[Trajectory]:
     n_usable = 0
     for recording in recordings:
-        joints, places, heights = _ways(recording, env, n_steps)
+        joints, positions, heights = _trajectories(recording, env, n_steps)
         if (heights > INK_HEIGHT).any():
             left_out["with the pen off the table"] += 1
         elif _collides(env, joints):
             left_out["in collision"] += 1
         else:
             if space == "pen":
-                check_on_sheet(places, f"the pen in {recording.name}")
+                check_on_sheet(positions, f"the pen in {recording.name}")
             n_usable += 1
-            yield Trajectory(joints if space == "joint" else places)
+            yield Trajectory(joints if space == "joint" else positions)
     if not n_usable:
         reasons = ", ".join(f"{number} {reason}" for reason, number in left_out.items())
         raise ValueError(
@@ -106,14 +106,14 @@ def _usable(
         )
 
 
-def _ways(
+def _trajectories(
     recording: HandwritingRecording, env: HandwritingEnv, n_steps: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Joint positions ``(T + 1, 9)``, places ``(T + 1, 2)`` and heights ``(T + 1,)`` of the pen [m]."""
+    """Joint positions ``(T + 1, 9)`` [rad; m], and positions ``(T + 1, 2)`` and heights ``(T + 1,)`` of the pen [m]."""
     if recording.values.shape[1] == 2:
         check_on_sheet(recording.values, f"the pen in {recording.name}")
-        places = recording.resampled(n_steps)
-        return env.kinematics.way(places), places, np.zeros(n_steps + 1)
+        positions = recording.resampled(n_steps)
+        return env.kinematics.joint_trajectory(positions), positions, np.zeros(n_steps + 1)
     env.check_joints(recording.values, f"the joints in {recording.name}")
     joints = recording.resampled(n_steps)
     tips = env.kinematics.tips(joints)

@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all handwriting datasets have in common: features and card."""
+"""The common parts of all handwriting datasets: features and card."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from lerobot_pf2mp.dataset_tools.writing.episodes import PICTURES
-from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, picture_feature
+from lerobot_pf2mp.dataset_tools.writing.episodes import IMAGE_KEY
+from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, image_feature
 from lerobot_pf2mp.envs.handwriting.panda import JOINT_NAMES
 from lerobot_pf2mp.envs.handwriting.sheet import HANDWRITING_FPS
 
 _NAMES = {"joint": list(JOINT_NAMES), "pen": ["x", "y"]}
 _MEANING = {
     "joint": "positions of the seven joints [rad] and the two fingers [m]",
-    "pen": "place x, y of the pen's tip [m]",
+    "pen": "position x, y of the pen's tip [m]",
 }
 
 _CARD = """\
@@ -44,17 +44,17 @@ def handwriting_spec(
     repo_id: str,
     origin: str,
     n_steps: int,
-    picture_size: tuple[int, int] | None = None,
+    image_size: tuple[int, int] | None = None,
 ) -> DatasetSpec:
-    """What a handwriting dataset holds besides its episodes.
+    """The metadata of a handwriting dataset.
 
     Args:
-        space: joint or pen.
-        name: What is written.
+        space: ``joint`` or ``pen``: states and actions are joint positions or positions of the pen's tip.
+        name: Name of the written letter or scene.
         repo_id: The dataset's name, ``user/name``.
-        origin: A sentence for the card: where the demonstrations come from.
-        n_steps: Steps that each has.
-        picture_size: Height and width of a camera's pictures [pixels]; None without a camera.
+        origin: A sentence for the card about the source of the demonstrations.
+        n_steps: Steps of each demonstration.
+        image_size: Height and width of a camera's images [pixels]; None without a camera.
     """
     description = f"Write {name} without entering a red region."
     card = _CARD.format(
@@ -68,6 +68,6 @@ def handwriting_spec(
     names = _NAMES[space]
     feature: dict[str, Any] = {"dtype": "float32", "shape": (len(names),), "names": names}
     features = {"observation.state": feature, "action": dict(feature)}
-    if picture_size is not None:
-        features[PICTURES] = picture_feature(picture_size)
+    if image_size is not None:
+        features[IMAGE_KEY] = image_feature(image_size)
     return DatasetSpec(repo_id, HANDWRITING_FPS, features, description, card)

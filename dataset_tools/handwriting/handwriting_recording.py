@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads recorded handwriting: joint positions or places of a pen, with times.
+"""Reads recorded handwriting: joint positions or positions of a pen, with times.
 
 | source | holds |
 |---|---|
@@ -7,8 +7,8 @@
 | JSON file | ``{"episodes": [{"time": [...], "joints": [[7 or 9 positions], ...]}, ...]}``, or ``"pen": [[x, y], ...]`` instead |
 | folder of a LeRobotDataset | actions of 7 joints, or of 7 joints and 2 fingers, as absolute positions |
 
-Joints are those of `lerobot_pf2mp.envs.handwriting.panda`, whose sixth and seventh are 0 where those of a real Panda are at pi/2 and
-pi/4; places are in the frame of the arm's base.
+Joint angles are those of the model in `lerobot_pf2mp.envs.handwriting.panda`. Its sixth and seventh joint are at 0 where those of a
+real Panda are at pi/2 and pi/4. Positions of the pen are in the frame of the arm's base.
 """  # noqa: E501
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ class HandwritingRecording:
 
     Args:
         times: ``(N,)`` [s], increasing.
-        values: ``(N, 9)`` positions of joints [rad] and fingers [m], or ``(N, 2)`` places x, y of the pen [m].
-        name: What to call it in messages.
+        values: ``(N, 9)`` positions of joints [rad] and fingers [m], or ``(N, 2)`` positions x, y of the pen [m].
+        name: Name for error messages.
 
     Raises:
-        ValueError: If something is not finite, the times do not increase, or it is too short.
+        ValueError: If a number is not finite, the times do not increase, or the recording is too short.
     """
 
     times: np.ndarray
@@ -70,15 +70,15 @@ class HandwritingRecording:
 
 
 def read_handwriting(path: Path, joint_offsets: Sequence[float] = ()) -> list[HandwritingRecording]:
-    """The recorded episodes.
+    """Reads the recorded episodes.
 
     Args:
-        path: Of one of the sources of this module.
-        joint_offsets: Added to the seven joints of the recording [rad]; none are 0.
+        path: One of the sources in the docstring of this module.
+        joint_offsets: Added to the seven joints of the recording [rad]; an empty sequence adds nothing.
 
     Raises:
         FileNotFoundError: If there is no such file or folder.
-        ValueError: If it is of another layout.
+        ValueError: If it has another layout.
     """
     path = path.expanduser()
     if not path.exists():

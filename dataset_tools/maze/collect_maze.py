@@ -20,7 +20,7 @@ def collect_maze(
     action_noise: float,
     seed: int,
     overwrite: bool,
-    picture_width: int | None = None,
+    image_width: int | None = None,
 ) -> tuple[int, Counter[str]]:
     """Collects collision-free demonstrations of a scripted expert as a LeRobotDataset.
 
@@ -31,9 +31,10 @@ def collect_maze(
         n_episodes: Demonstrations to write.
         n_steps: Steps that each is resampled to.
         action_noise: Standard deviation of noise on the expert's normalised force.
-        seed: Seed of everything random.
-        overwrite: Whether a dataset already there is replaced.
-        picture_width: Longer side of the pictures that are recorded instead of the goal's place [pixels]; None for none.
+        seed: Seed of all random numbers.
+        overwrite: Whether an existing dataset is replaced.
+        image_width: Longer side of the images that are recorded instead of the goal's position [pixels]; None records no
+            images.
 
     Returns:
         The number of episodes written, and the number of those left out, by reason.
@@ -55,7 +56,7 @@ def collect_maze(
         n_steps=n_steps,
         n_episodes=n_episodes,
         overwrite=overwrite,
-        picture_width=picture_width,
+        image_width=image_width,
     )
     dropped["in collision"] += expert.n_collisions
     return n_written, +dropped

@@ -15,28 +15,28 @@ from lerobot_pf2mp.envs.maze.point_maze import parse_maze_map
 
 # In D4RL's model the walls of cell (i, j) are centred at (i + 1, j + 1) and the ball's joints start at (1.2, 1.2).
 _CELL_OFFSET = 1.2 - 1.0
-# Same goal: its noise is drawn once, so that only rounding separates two records of it.
+# Two recorded goals within this distance are the same goal: they differ only by rounding, as its noise is drawn once.
 _SAME_GOAL = 1e-5  # [m]
-_SLICE_ROWS = 2**16  # read at a time
+_SLICE_ROWS = 2**16  # rows that are read at a time
 
 
 def read_d4rl(path: Path, maze: str) -> tuple[int, Iterator[Trajectory]]:
-    """The start-goal trajectories of a D4RL maze2d file, in the coordinates of this package's environment.
+    """Reads the start-goal trajectories of a D4RL maze2d file, in the coordinates of this package's environment.
 
-    A trajectory ends where ``timeouts`` says so or the recorded goal changes. Files with and without ``timeouts`` occur.
-    The file is read in slices: memory does not grow with its length, but for a few numbers a trajectory.
+    A trajectory ends where ``timeouts`` is true or the recorded goal changes. Some files have no ``timeouts``. The file is
+    read in slices: apart from a few numbers per trajectory, memory does not grow with its length.
 
     Args:
         path: The HDF5 file.
         maze: The maze it was recorded in, as for `parse_maze_map`.
 
     Returns:
-        Their number, and the trajectories, which are read as they are asked for.
+        Their number, and the trajectories, which are read lazily.
 
     Raises:
         FileNotFoundError: If there is no such file.
         ValueError: If it is not a whole HDF5 file of D4RL's layout, or holds NaN or infinity; for the observations, when
-            the trajectories are asked for.
+            the trajectories are read.
     """
     path = Path(path).expanduser()
     if not path.is_file():
@@ -51,9 +51,9 @@ def read_d4rl(path: Path, maze: str) -> tuple[int, Iterator[Trajectory]]:
 def _trajectories(
     path: Path, starts: np.ndarray, goals: np.ndarray, rows: list[list[int]]
 ) -> Iterator[Trajectory]:
-    """The trajectories that begin at some rows ``(E,)`` and lead to goals ``(E, 2)``."""
+    """The trajectories that begin at the rows ``(E,)`` and lead to the goals ``(E, 2)``."""
     with _opened(path) as file:
-        pending: list[np.ndarray] = []  # what has been read of the trajectory that is not over
+        pending: list[np.ndarray] = []  # the parts read so far of the current trajectory
         number = 0
         for first, observations in _slices(file, "observations", path):
             ends = starts[(starts > first) & (starts <= first + len(observations))] - first
@@ -68,7 +68,7 @@ def _trajectories(
 def _find_starts(file: h5py.File, path: Path) -> tuple[np.ndarray, np.ndarray]:
     """The first row ``(E,)`` of each trajectory, and its goal ``(E, 2)`` in D4RL's coordinates [m]."""
     starts, start_goals = [], []
-    last_goal, is_over = file["infos/goal"][:1], True  # in the row before
+    last_goal, is_over = file["infos/goal"][:1], True  # values of the previous row
     for first, goals in _slices(file, "infos/goal", path):
         is_last = np.zeros(len(goals), bool)
         if "timeouts" in file:
@@ -82,7 +82,7 @@ def _find_starts(file: h5py.File, path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _slices(file: h5py.File, name: str, path: Path) -> Iterator[tuple[int, np.ndarray]]:
-    """The rows of a column, in slices, and the number of each one's first row."""
+    """The rows of a column in slices, each with the number of its first row."""
     for first in range(0, len(file[name]), _SLICE_ROWS):
         values = np.asarray(file[name][first : first + _SLICE_ROWS], dtype=np.float64)
         bad = ~np.isfinite(values).all(axis=1)
@@ -127,6 +127,6 @@ def _is_column(entry: object) -> bool:
 
 
 def _to_environment(positions: np.ndarray, rows: list[list[int]]) -> np.ndarray:
-    """From D4RL's joint positions, first axis along rows and second along columns, to x east and y north [m]."""
+    """Converts D4RL's joint positions (first axis along rows, second along columns) to x east and y north [m]."""
     row, column = (positions + _CELL_OFFSET).T
     return np.stack([column + 0.5 - len(rows[0]) / 2, len(rows) / 2 - (row + 0.5)], axis=1)

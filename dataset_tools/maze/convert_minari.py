@@ -13,7 +13,7 @@ from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory
 
 
 def read_minari(path: Path) -> tuple[int, Iterator[Trajectory]]:
-    """The trajectories of a Minari PointMaze dataset, whose coordinates are this package's own.
+    """Reads the trajectories of a Minari PointMaze dataset. Its coordinates are those of this package.
 
     Args:
         path: The dataset's folder, for example ``~/.minari/datasets/D4RL/pointmaze/large-v2``.

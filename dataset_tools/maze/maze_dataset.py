@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all maze datasets have in common: features, card, collision test."""
+"""The common parts of all maze datasets: features, card and collision test."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_pf2mp.dataset_tools.writing.episodes import PICTURES, Trajectory, resample
-from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, picture_feature
+from lerobot_pf2mp.dataset_tools.writing.episodes import IMAGE_KEY, Trajectory, resample
+from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, image_feature
 from lerobot_pf2mp.dataset_tools.writing.write_trajectories import write_trajectories
-from lerobot_pf2mp.envs.maze.maze_image import MazePicture
+from lerobot_pf2mp.envs.maze.maze_image import MazeImage
 from lerobot_pf2mp.envs.maze.point_maze import BALL_RADIUS, make_point_maze
 from lerobot_pf2mp.envs.maze.swept_ball import SweptBall
 from lerobot_pf2mp.envs.tasks import MAZE_OF_TASK
@@ -28,7 +28,7 @@ _FEATURES = {
 }
 
 _GOAL = "| `observation.environment_state` | position x, y of the goal | m |"
-_PICTURES = "| `observation.image` | the maze from above | |"
+_IMAGES = "| `observation.image` | the maze from above | |"
 _CARD = """\
 ---
 license: apache-2.0
@@ -53,7 +53,11 @@ Made with lerobot_policy_pf2mp.
 
 
 def maze_of(task: str, maze_map: str | None) -> str:
-    """The maze of a task, or a map given instead of it.
+    """The maze of a task, or the given map instead.
+
+    Args:
+        task: A key of `MAZE_OF_TASK`.
+        maze_map: As for `parse_maze_map`; None uses the maze of the task.
 
     Raises:
         ValueError: If there is no such task.
@@ -76,27 +80,41 @@ def write_maze_dataset(
     n_episodes: int | None = None,
     n_expected: int | None = None,
     overwrite: bool = False,
-    picture_width: int | None = None,
+    image_width: int | None = None,
 ) -> tuple[int, Counter[str]]:
-    """Writes the usable ones of some trajectories in a maze as a LeRobotDataset.
+    """Writes the usable trajectories in a maze as a LeRobotDataset.
 
-    As `write_trajectories`, with the same arguments, result and errors; `trajectories` are in the coordinates of the
-    environment [m]. Besides, there is `repo_id`, the dataset's name ``user/name``; `maze`, as for `parse_maze_map`, whose
-    walls a trajectory must not touch; and `origin`, a sentence for the card: where the trajectories come from.
+    Errors are those of `write_trajectories`.
+
+    Args:
+        trajectories: Trajectories in the coordinates of the environment [m].
+        root: The dataset's folder.
+        repo_id: The dataset's name, ``user/name``.
+        maze: As for `parse_maze_map`; a trajectory must not touch its walls.
+        origin: A sentence for the card about the source of the trajectories.
+        n_steps: Steps T that each trajectory is resampled to.
+        n_episodes: Largest number of episodes to write; None writes all.
+        n_expected: Number of trajectories, for the progress bar, if it is known.
+        overwrite: Whether an existing dataset is replaced.
+        image_width: Longer side of the images that are recorded instead of the goal's position [pixels]; None records no
+            images.
+
+    Returns:
+        The number of episodes written, and the number of those left out, by reason.
     """
     point_maze, model = make_point_maze(maze)
     features: dict[str, Any] = dict(_FEATURES)
-    if picture_width is not None:
-        picture = MazePicture(point_maze.maze.maze_map, picture_width)
-        trajectories = _with_pictures(trajectories, picture, n_steps)
+    if image_width is not None:
+        image = MazeImage(point_maze.maze.maze_map, image_width)
+        trajectories = _with_images(trajectories, image, n_steps)
         del features["observation.environment_state"]
-        features[PICTURES] = picture_feature(picture.size)
+        features[IMAGE_KEY] = image_feature(image.size)
     card = _CARD.format(
         title=repo_id,
         origin=origin,
         n_steps=n_steps,
         fps=FPS,
-        surroundings=_PICTURES if picture_width else _GOAL,
+        surroundings=_IMAGES if image_width else _GOAL,
     )
     return write_trajectories(
         trajectories,
@@ -110,15 +128,13 @@ def write_maze_dataset(
     )
 
 
-def _with_pictures(
-    trajectories: Iterable[Trajectory], picture: MazePicture, n_steps: int
-) -> Iterator[Trajectory]:
-    """The trajectories, resampled, with what the environment would show on the way."""
+def _with_images(trajectories: Iterable[Trajectory], image: MazeImage, n_steps: int) -> Iterator[Trajectory]:
+    """The resampled trajectories, with the images that the environment would render at each step."""
     for trajectory in trajectories:
         assert trajectory.goal is not None  # there is one in every maze
-        way = resample(trajectory.positions, n_steps)
-        pictures = [
-            picture.draw(ball=way[i], goal=trajectory.goal, path=way[: i + 1], collisions=())
-            for i in range(len(way))
+        positions = resample(trajectory.positions, n_steps)
+        images = [
+            image.draw(ball=positions[i], goal=trajectory.goal, path=positions[: i + 1], collisions=())
+            for i in range(len(positions))
         ]
-        yield Trajectory(way, trajectory.goal, pictures=np.array(pictures))
+        yield Trajectory(positions, trajectory.goal, images=np.array(images))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Demonstrations of a ball driven through a maze, in the manner of D4RL's maze2d generator (Fu et al., 2020)."""
+"""A scripted expert that drives a ball through a maze, like D4RL's maze2d generator (Fu et al., 2020)."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import numpy as np
 from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory
 from lerobot_pf2mp.envs.maze.point_maze import make_point_maze, step_physics
 
-WAYPOINT_RADIUS = 0.1  # [m] a waypoint counts as reached, as in D4RL
-WAYPOINT_JITTER = 0.1  # [m] waypoints lie this far off the cell centres at most, on both axes
-GOAL_JITTER = 0.25  # [m] goals and starts likewise, as PointMaze places them
+WAYPOINT_RADIUS = 0.1  # within this distance a waypoint counts as reached, as in D4RL [m]
+WAYPOINT_JITTER = 0.1  # largest distance of waypoints to the cell centres, on each axis [m]
+GOAL_JITTER = 0.25  # the same for goals and starts, as in PointMaze [m]
 MAX_PHYSICS_STEPS = 3000  # [0.01 s]
 
 Cell = tuple[int, int]
@@ -23,14 +23,14 @@ Cell = tuple[int, int]
 class MazeExpert:
     """Drives the ball of PointMaze from goal to goal along shortest paths through cell centres.
 
-    A PD controller with clipped force, in full physics. Each goal is resampled when it is reached and the ball goes on
-    from where it is. D4RL places its goals up to 0.1 m off the cell centres; here they spread as PointMaze's do at
-    evaluation.
+    A PD controller with clipped force drives it, in full physics. When a goal is reached, the next one is drawn, and the
+    ball continues from its position. D4RL's goals are up to 0.1 m from the cell centres. Here they are distributed as in
+    PointMaze at evaluation.
 
     Args:
         maze_map: As for `parse_maze_map`.
         action_noise: Standard deviation of Gaussian noise on the normalised force (D4RL's noisy data uses 0.5).
-        seed: Seed of everything random.
+        seed: Seed of all random numbers.
 
     Raises:
         ValueError: If the noise or the seed is negative, or the map is not a maze.
@@ -48,7 +48,7 @@ class MazeExpert:
         rows = self._maze.maze_map
         self._cells = [(i, j) for i, row in enumerate(rows) for j, cell in enumerate(row) if cell == 0]
         self._is_free = set(self._cells)
-        self._place_anywhere()
+        self._place_randomly()
         self._n_ground_contacts = self._env.data.ncon
         self.n_collisions = 0
 
@@ -61,12 +61,12 @@ class MazeExpert:
             positions = self._drive(start, tuple(cell), goal)
             if positions is None:
                 self.n_collisions += 1
-                self._place_anywhere()
+                self._place_randomly()
             else:
                 yield Trajectory(np.array(positions), goal)
 
     def _drive(self, start: Cell, cell: Cell, goal: np.ndarray) -> list[list[float]] | None:
-        """The positions on the way to the goal, or None after a collision."""
+        """The positions of the ball until it reaches the goal [m]; None after a collision."""
         waypoints = [self._off_centre(c, WAYPOINT_JITTER) for c in self._shortest_path(start, cell)[1:-1]]
         positions = [self._position().tolist()]
         model, data = self._env.model, self._env.data
@@ -82,7 +82,7 @@ class MazeExpert:
         return positions
 
     def _shortest_path(self, start: Cell, goal: Cell) -> list[Cell]:
-        """Breadth-first search, from the goal, so that paths to one goal agree where they meet."""
+        """The shortest path, by breadth-first search from the goal. So paths to one goal coincide after they meet."""
         towards: dict[Cell, Cell] = {goal: goal}
         queue = deque([goal])
         while start not in towards:
@@ -99,7 +99,7 @@ class MazeExpert:
     def _off_centre(self, cell: Cell, jitter: float) -> np.ndarray:
         return self._maze.cell_rowcol_to_xy(np.array(cell)) + self._rng.uniform(-jitter, jitter, size=2)
 
-    def _place_anywhere(self) -> None:
+    def _place_randomly(self) -> None:
         cell = self._cells[self._rng.integers(len(self._cells))]
         self._env.point_env.set_state(self._off_centre(cell, GOAL_JITTER), np.zeros(2))
 

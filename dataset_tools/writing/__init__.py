@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Episodes, and how they become a LeRobotDataset."""
+"""Episodes, and the writers that turn them into a LeRobotDataset."""

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 
 from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory
 
-# An expert that succeeds in fewer of its first attempts would take for ever.
+# With fewer successes in its first attempts, an expert would need too long.
 _N_FIRST_ATTEMPTS, _MIN_SUCCESSES = 200, 4
 
 
@@ -16,8 +16,8 @@ def successful(attempts: Iterable[Trajectory | str], failed: Counter[str]) -> It
     """The attempts that succeeded.
 
     Args:
-        attempts: A trajectory for each attempt that succeeded, for the others the reason why not.
-        failed: Counts the others, by reason.
+        attempts: For each attempt its trajectory if it succeeded, otherwise the reason for the failure.
+        failed: Counts the failures, by reason.
 
     Raises:
         ValueError: If almost none of the first attempts succeeds.

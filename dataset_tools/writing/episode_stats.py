@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""LeRobot's statistics of numeric features, of many episodes in one call."""
+"""LeRobot's statistics of numeric features, for many episodes in one call."""
 
 from __future__ import annotations
 
 import numpy as np
 from lerobot.datasets.compute_stats import DEFAULT_QUANTILES
 
-_N_BINS = 5000  # of the histogram that LeRobot reads its quantiles from
+_N_BINS = 5000  # bins of the histogram from which LeRobot computes its quantiles
 _EDGE_PADDING = 1e-10
 
 
 def compute_stats(values: np.ndarray, lengths: np.ndarray) -> dict[str, np.ndarray]:
-    """The statistics of one feature in each of E episodes, as LeRobot's ``compute_episode_stats`` gives them.
+    """The statistics of one feature in each of E episodes, equal to those of LeRobot's ``compute_episode_stats``.
 
-    That function goes through a histogram of 5000 bins for each number of each episode; this one computes the few entries
-    of the histogram that the quantiles depend on, with the same rounding, for all episodes of one length together.
+    LeRobot's function builds a histogram of 5000 bins for each dimension of each episode. This one computes only the few
+    entries of the histogram on which the quantiles depend, with the same rounding, for all episodes of one length together.
 
     Args:
         values: ``(N, D)`` the frames of all episodes, one after the other; finite.
@@ -37,12 +37,12 @@ def compute_stats(values: np.ndarray, lengths: np.ndarray) -> dict[str, np.ndarr
 
 
 def aggregate_episodes(stats: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The statistics of one feature over all episodes, as LeRobot's ``aggregate_feature_stats`` gives them.
+    """The statistics of one feature over all episodes, equal to those of LeRobot's ``aggregate_feature_stats``.
 
     Quantiles are the mean of the episodes' quantiles, as in LeRobot.
 
     Args:
-        stats: What `compute_stats` returned.
+        stats: The result of `compute_stats`.
 
     Returns:
         The same entries, ``(D,)`` each and ``count`` ``(1,)``.
@@ -86,7 +86,7 @@ def _quantiles(frames: np.ndarray, first_edge: np.ndarray, last_edge: np.ndarray
     """The quantiles (E, Q, D) of (E, T, D) frames, interpolated in a histogram between two edges (E, D)."""
     n_frames = frames.shape[1]
     targets = np.array(DEFAULT_QUANTILES) * n_frames
-    # The bin that brings the cumulated counts to the target holds the value of that rank.
+    # The bin in which the cumulative count reaches the target holds the value of that rank.
     reaching = np.sort(frames, axis=1)[:, np.ceil(targets).astype(int) - 1]  # (E, Q, D)
     first_edge, last_edge = first_edge[:, None], last_edge[:, None]  # (E, 1, D)
     width = (last_edge - first_edge) / _N_BINS

@@ -10,24 +10,24 @@ from dataclasses import dataclass
 import numpy as np
 
 MIN_STEPS = 2
-PICTURES = "observation.image"
+IMAGE_KEY = "observation.image"
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A demonstrated way.
+    """A demonstrated trajectory.
 
     Args:
         positions: ``(N + 1, D)`` positions at equal time intervals [m], joints [rad].
-        goal: ``(D,)`` where it was meant to end [m]; None where that is always the same.
-        objects: ``(N + 1, E)`` what else moved, for example the positions of a block [m]; None for nothing.
-        pictures: ``(N + 1, H, W, 3)`` uint8 what a camera saw; None without a camera.
+        goal: ``(D,)`` its goal [m]; None if the goal is always the same.
+        objects: ``(N + 1, E)`` positions of moving objects, for example of a block [m]; None without objects.
+        images: ``(N + 1, H, W, 3)`` uint8 camera images; None without a camera.
     """
 
     positions: np.ndarray
     goal: np.ndarray | None = None
     objects: np.ndarray | None = None
-    pictures: np.ndarray | None = None
+    images: np.ndarray | None = None
 
     @property
     def n_steps(self) -> int:
@@ -36,14 +36,14 @@ class Trajectory:
 
 
 def resample(positions: np.ndarray, n_steps: int) -> np.ndarray:
-    """The same way in another number of steps, by linear interpolation in time.
+    """The same trajectory in another number of steps, by linear interpolation in time.
 
     Args:
         positions: ``(N + 1, D)`` positions at equal time intervals.
         n_steps: The wanted number of steps T.
 
     Returns:
-        ``(T + 1, D)`` positions; the first and the last are the given ones.
+        ``(T + 1, D)`` positions; the first and the last are unchanged.
     """
     at = np.linspace(0, len(positions) - 1, n_steps + 1)
     before = np.minimum(at.astype(int), len(positions) - 2)
@@ -57,18 +57,18 @@ def prepare(
     collides: Callable[[np.ndarray], bool],
     dropped: Counter[str],
 ) -> Iterator[dict[str, np.ndarray]]:
-    """The frames of all usable trajectories: position and goal observed, next position as action.
+    """The frames of all usable trajectories. Observations are position and goal; the action is the next position.
 
     Args:
         trajectories: Recorded trajectories.
         n_steps: Steps that each is resampled to.
-        collides: Whether a ``(T + 1, D)`` way touches an obstacle.
+        collides: Whether a ``(T + 1, D)`` trajectory touches an obstacle.
         dropped: Counts the trajectories left out, by reason.
 
     Yields:
         For each trajectory ``{"observation.state", "observation.environment_state", "action"}``, float32 [m]: positions
-        ``(T, D)``, objects and goal ``(T, E + D)`` as far as there are any, next positions ``(T, D)``; and the last pictures
-        taken before them, `PICTURES` ``(T, H, W, 3)``, if there are any.
+        ``(T, D)``; objects and goal ``(T, E + D)`` if there are any; next positions ``(T, D)``. If there are images, also
+        `IMAGE_KEY` ``(T, H, W, 3)``, the latest image at each step.
 
     Raises:
         ValueError: If a trajectory is not finite.
@@ -80,21 +80,23 @@ def prepare(
         if trajectory.n_steps < MIN_STEPS:
             dropped[f"shorter than {MIN_STEPS} steps"] += 1
             continue
-        way = resample(trajectory.positions, n_steps)
-        if collides(way):
+        positions = resample(trajectory.positions, n_steps)
+        if collides(positions):
             dropped["in collision"] += 1
             continue
         frames = {
-            "observation.state": way[:-1].astype(np.float32),
-            "action": way[1:].astype(np.float32),
+            "observation.state": positions[:-1].astype(np.float32),
+            "action": positions[1:].astype(np.float32),
         }
-        surroundings = []
+        environment_state = []
         if trajectory.objects is not None:
-            surroundings.append(resample(trajectory.objects, n_steps)[:-1])
+            environment_state.append(resample(trajectory.objects, n_steps)[:-1])
         if trajectory.goal is not None:
-            surroundings.append(np.tile(trajectory.goal, (n_steps, 1)))
-        if surroundings:
-            frames["observation.environment_state"] = np.concatenate(surroundings, axis=1).astype(np.float32)
-        if trajectory.pictures is not None:
-            frames[PICTURES] = trajectory.pictures[np.arange(n_steps) * trajectory.n_steps // n_steps]
+            environment_state.append(np.tile(trajectory.goal, (n_steps, 1)))
+        if environment_state:
+            frames["observation.environment_state"] = np.concatenate(environment_state, axis=1).astype(
+                np.float32
+            )
+        if trajectory.images is not None:
+            frames[IMAGE_KEY] = trajectory.images[np.arange(n_steps) * trajectory.n_steps // n_steps]
         yield frames

@@ -20,26 +20,26 @@ from lerobot.datasets.utils import DEFAULT_EPISODES_PATH, update_chunk_file_indi
 from lerobot_pf2mp.dataset_tools.writing.episode_stats import aggregate_episodes, compute_stats
 from lerobot_pf2mp.process.atomic_files import written_beside
 
-_BATCH_FRAMES = 2**16  # kept in memory, and more by less than an episode
+_BATCH_FRAMES = 2**16  # frames in memory; a batch exceeds it by less than one episode
 
 _Episode = dict[str, np.ndarray]
 _Stats = dict[str, dict[str, np.ndarray]]
 
 
-def picture_feature(picture_size: tuple[int, int]) -> dict[str, Any]:
-    """The feature of a camera whose pictures have a height and a width [pixels]."""
-    return {"dtype": "video", "shape": (*picture_size, 3), "names": ["height", "width", "channels"]}
+def image_feature(image_size: tuple[int, int]) -> dict[str, Any]:
+    """The feature of a camera with images of this height and width [pixels]."""
+    return {"dtype": "video", "shape": (*image_size, 3), "names": ["height", "width", "channels"]}
 
 
 @dataclass(frozen=True)
 class DatasetSpec:
-    """What a dataset holds besides its episodes.
+    """The metadata of a dataset.
 
     Args:
         repo_id: Its name, ``user/name``.
-        fps: Nominal frames for each second [Hz].
+        fps: Nominal frames per second [Hz].
         features: LeRobot's feature dictionary of the columns that episodes provide, all numeric.
-        task: What the demonstrations do, in words.
+        task: Description of the task in words.
         card: Text of its README.md.
     """
 
@@ -55,15 +55,15 @@ def write_dataset(
 ) -> int:
     """Writes episodes as a LeRobotDataset that LeRobot reads like one of its own.
 
-    Statistics are computed and metadata laid out for many episodes in one call; frames go to parquet in whole episodes, one
-    row group each, as LeRobot's recorder leaves them. In memory are `_BATCH_FRAMES` frames and parquet's index of the row
-    groups of one file, 14 kB an episode, until that is full.
+    Statistics and metadata are computed for many episodes in one call. Each episode is one row group of a parquet file, as
+    in the datasets of LeRobot's recorder. Memory holds `_BATCH_FRAMES` frames, and parquet's index of the row groups of the
+    current file, 14 kB for each episode.
 
     Args:
         root: The dataset's folder.
-        spec: What it holds besides the episodes.
+        spec: The metadata of the dataset.
         episodes: For each episode ``{feature: (T, ...) array}`` for the features of the specification, T >= 1.
-        overwrite: Whether a dataset already there is replaced.
+        overwrite: Whether an existing dataset is replaced.
 
     Returns:
         The number of episodes written.
@@ -95,11 +95,11 @@ def write_dataset(
 
 
 class _ParquetFiles:
-    """Numbered parquet files; the next is begun where LeRobot would begin it, when the size limit would be reached.
+    """Writes numbered parquet files. As in LeRobot, a new file begins when the next rows would exceed the size limit.
 
     Args:
-        meta: Where they belong, and their limits.
-        path_format: Their paths in the dataset's folder.
+        meta: The metadata of the dataset, with its folder and the size limit.
+        path_format: Format of the files' paths in the dataset's folder.
     """
 
     def __init__(self, meta: LeRobotDatasetMetadata, path_format: str) -> None:
@@ -107,7 +107,7 @@ class _ParquetFiles:
         self._path_format = path_format
         self._writer: pq.ParquetWriter | None = None
         self._n_rows = 0  # in the current file
-        self._place = 0, 0
+        self._indices = 0, 0
         self._path = Path()
 
     def __enter__(self) -> _ParquetFiles:
@@ -117,20 +117,20 @@ class _ParquetFiles:
         if self._writer is not None:
             self._writer.close()
 
-    def place_for(self, n_rows: int) -> tuple[int, int]:
-        """The chunk and file index of where the next rows are to go."""
+    def indices_for(self, n_rows: int) -> tuple[int, int]:
+        """The chunk and file index for the next rows."""
         if self._writer is not None:
             size = get_file_size_in_mb(self._path)
             if size + size / self._n_rows * n_rows >= self._meta.data_files_size_in_mb:
                 self._writer.close()
                 self._writer = None
-                self._place = update_chunk_file_indices(*self._place, self._meta.chunks_size)
-        return self._place
+                self._indices = update_chunk_file_indices(*self._indices, self._meta.chunks_size)
+        return self._indices
 
     def append(self, table: pa.Table) -> None:
-        """Writes rows, as a row group, where `place_for` said."""
+        """Writes rows as one row group, to the file that `indices_for` returned."""
         if self._writer is None:
-            chunk_index, file_index = self._place
+            chunk_index, file_index = self._indices
             self._path = self._meta.root / self._path_format.format(
                 chunk_index=chunk_index, file_index=file_index
             )
@@ -144,7 +144,7 @@ class _ParquetFiles:
 
 
 def _batches(episodes: Iterable[_Episode], features: dict[str, dict[str, Any]]) -> Iterator[list[_Episode]]:
-    """The episodes, checked, in lists of `_BATCH_FRAMES` frames or a little more."""
+    """Checks the episodes and yields them in lists of `_BATCH_FRAMES` frames or a little more."""
     batch: list[_Episode] = []
     n_frames = 0
     for number, episode in enumerate(episodes):
@@ -164,18 +164,18 @@ def _write_batch(
     batch: list[_Episode],
     spec: DatasetSpec,
 ) -> _Stats:
-    """Writes episodes and their metadata; returns their statistics, aggregated."""
+    """Writes episodes and their metadata; returns their aggregated statistics."""
     lengths = np.array([len(next(iter(episode.values()))) for episode in batch])
     starts = np.cumsum(lengths) - lengths
     frames = _frames(meta, batch, lengths, spec)
     stats = {key: compute_stats(frames[key].reshape(len(frames[key]), -1), lengths) for key in meta.features}
     features = get_hf_features_from_features(meta.features)
     table = pa.table({key: _arrow(frames[key]) for key in features}).cast(features.arrow_schema)
-    places = []
+    file_indices = []
     for start, n_frames in zip(starts.tolist(), lengths.tolist(), strict=True):
-        places.append(frame_files.place_for(n_frames))
+        file_indices.append(frame_files.indices_for(n_frames))
         frame_files.append(table.slice(start, n_frames))
-    _write_episodes(meta, episode_files, lengths, places, stats, spec)
+    _write_episodes(meta, episode_files, lengths, file_indices, stats, spec)
     meta.info.total_episodes += len(lengths)
     meta.info.total_frames += len(table)
     return {key: aggregate_episodes(stats[key]) for key in stats}
@@ -184,7 +184,7 @@ def _write_batch(
 def _frames(
     meta: LeRobotDatasetMetadata, batch: list[_Episode], lengths: np.ndarray, spec: DatasetSpec
 ) -> dict[str, np.ndarray]:
-    """All columns ``(N, ...)`` of the frames, those included that LeRobot adds."""
+    """All columns ``(N, ...)`` of the frames, including those that LeRobot adds."""
     n_frames = int(lengths.sum())
     frame_index = np.arange(n_frames) - np.repeat(np.cumsum(lengths) - lengths, lengths)
     return {
@@ -201,15 +201,15 @@ def _write_episodes(
     meta: LeRobotDatasetMetadata,
     files: _ParquetFiles,
     lengths: np.ndarray,
-    places: list[tuple[int, int]],
+    file_indices: list[tuple[int, int]],
     stats: _Stats,
     spec: DatasetSpec,
 ) -> None:
-    """Writes the metadata of episodes whose frames went to some chunks and files."""
+    """Writes the metadata of episodes whose frames are in the files with these chunk and file indices."""
     n_episodes = len(lengths)
     ends = meta.total_frames + np.cumsum(lengths)
-    data_chunk, data_file = np.array(places).T
-    meta_chunk, meta_file = files.place_for(n_episodes)
+    data_chunk, data_file = np.array(file_indices).T
+    meta_chunk, meta_file = files.indices_for(n_episodes)
     columns = {
         "episode_index": meta.total_episodes + np.arange(n_episodes),
         "tasks": pa.array([[spec.task]] * n_episodes),
@@ -243,7 +243,7 @@ def _lists(rows: np.ndarray) -> pa.Array:
 
 
 def _check(episode: _Episode, features: dict[str, dict[str, Any]], number: int) -> int:
-    """The number of frames of an episode, if nothing is wrong with it."""
+    """Checks an episode and returns its number of frames."""
     if set(episode) != set(features):
         raise ValueError(f"episode {number} must hold {sorted(features)}, got {sorted(episode)}")
     n_frames = len(next(iter(episode.values())))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes episodes with pictures as a LeRobotDataset v3, by LeRobot's own recorder."""
+"""Writes episodes with images as a LeRobotDataset v3, with LeRobot's own recorder."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec
 from lerobot_pf2mp.process.atomic_files import written_beside
 
 
-def has_pictures(spec: DatasetSpec) -> bool:
-    """Whether a dataset holds pictures."""
+def has_images(spec: DatasetSpec) -> bool:
+    """Whether a dataset holds images."""
     return any(feature["dtype"] == "video" for feature in spec.features.values())
 
 
 def write_video_dataset(
     root: Path, spec: DatasetSpec, episodes: Iterable[dict[str, np.ndarray]], overwrite: bool = False
 ) -> int:
-    """Writes episodes with pictures; the arguments, the result and the errors are those of `write_dataset`.
+    """Writes episodes with images; the arguments, the result and the errors are those of `write_dataset`.
 
-    Features of dtype ``video`` take ``(T, H, W, 3)`` uint8 pictures.
+    Features of dtype ``video`` take ``(T, H, W, 3)`` uint8 images.
     """
     with written_beside(root, overwrite, kind="dataset", mark="meta/info.json", option="--root") as partial:
         dataset = LeRobotDataset.create(
@@ -40,7 +40,7 @@ def write_video_dataset(
             if not n_written:
                 raise ValueError("a dataset must hold at least one episode, got none that is usable")
         finally:
-            # Also after an error: otherwise the encoder goes on writing into the folder after it has been removed.
+            # Also after an error. Otherwise the encoder continues to write into the folder after its removal.
             if dataset.has_pending_frames():
                 dataset.clear_episode_buffer()
             dataset.finalize()

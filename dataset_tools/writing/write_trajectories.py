@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Turns trajectories into a LeRobotDataset, with a progress bar and a count of those left out."""
+"""Writes trajectories as a LeRobotDataset, with a progress bar and a count of the trajectories left out."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory, prepare
 from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, write_dataset
-from lerobot_pf2mp.dataset_tools.writing.video_writer import has_pictures, write_video_dataset
+from lerobot_pf2mp.dataset_tools.writing.video_writer import has_images, write_video_dataset
 
 
 def write_trajectories(
@@ -28,17 +28,17 @@ def write_trajectories(
     n_expected: int | None = None,
     overwrite: bool = False,
 ) -> tuple[int, Counter[str]]:
-    """Writes the usable ones of some trajectories as a LeRobotDataset.
+    """Writes the usable trajectories as a LeRobotDataset.
 
     Args:
         trajectories: The trajectories.
         root: The dataset's folder.
-        spec: What the dataset holds besides its episodes; of these the features that it names are written.
+        spec: The metadata of the dataset. Only the features that it names are written.
         n_steps: Steps T that each trajectory is resampled to.
-        collides: Whether a ``(T + 1, D)`` way touches an obstacle; such trajectories are left out.
-        n_episodes: Most episodes to write; None writes all.
+        collides: Whether a ``(T + 1, D)`` trajectory touches an obstacle; such trajectories are left out.
+        n_episodes: Largest number of episodes to write; None writes all.
         n_expected: Number of trajectories, for the progress bar, if it is known.
-        overwrite: Whether a dataset already there is replaced.
+        overwrite: Whether an existing dataset is replaced.
 
     Returns:
         The number of episodes written, and the number of those left out, by reason.
@@ -54,9 +54,9 @@ def write_trajectories(
     dropped: Counter[str] = Counter()
     prepared = prepare(trajectories, n_steps, collides, dropped)
     usable = islice(({key: frames[key] for key in spec.features} for frames in prepared), n_episodes)
-    # Closed here rather than by the garbage collector, so that an interrupted bar is not drawn again at the end.
+    # Closed here, not by the garbage collector, so that an interrupted bar is not drawn again at the end.
     with closing(_with_progress(usable, n_episodes or n_expected)) as episodes:
-        write = write_video_dataset if has_pictures(spec) else write_dataset
+        write = write_video_dataset if has_images(spec) else write_dataset
         n_written = write(root, spec, episodes, overwrite=overwrite)
     return n_written, dropped
 

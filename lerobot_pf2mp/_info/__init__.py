@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command pf2mp-info, installed beside `lerobot_pf2mp` as the module ``pf2mp_info``.
 
-Importing `lerobot_pf2mp` imports LeRobot and torch, and this command has to run where just that fails: nothing here imports
-more than the standard library before it is known what happens.
+Nearly everything in `lerobot_pf2mp` imports LeRobot and torch. This command must also run where that import fails. So its
+modules import only the standard library; everything else is imported in the probes, where an error is reported.
 """

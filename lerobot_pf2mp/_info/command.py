@@ -9,15 +9,15 @@ from dataclasses import dataclass
 from importlib.metadata import version
 
 from .probes import DISTRIBUTION
-from .report import as_json, as_text, gather, is_well
+from .report import as_json, as_row, gather, is_well, verdict
 
 
 @dataclass
 class InfoConfig:
-    """Says what is installed, whether LeRobot finds this package, what works here, and what to do about the rest.
+    """Reports what is installed, whether LeRobot finds this package, what works here, and how to repair the rest.
 
-    Each line ends in ok, optional (not here, and needed only for what the line says) or problem. Ends with code 0 if
-    there is no problem, else 1.
+    Each line ends in ok, optional (missing, but needed only for the feature that the line names) or problem. The exit code
+    is 0 if there is no problem, else 1.
 
     Examples:
         pf2mp-info
@@ -26,7 +26,7 @@ class InfoConfig:
 
     # Whether to write JSON, for issue reports, instead of a table.
     json: bool = False
-    # Longest that each trial may take [s].
+    # Largest duration of each trial [s].
     time_limit: float = 120.0
 
 
@@ -36,11 +36,15 @@ def main() -> None:
         print(f"pf2mp-info {version(DISTRIBUTION)}")
         return
     config = _parsed()
+    lines = []
     try:
-        lines = gather(config.time_limit)
+        for line in gather(config.time_limit):
+            lines.append(line)
+            if not config.json:
+                print(as_row(line), flush=True)
     except KeyboardInterrupt:
         sys.exit(130)
-    print((as_json if config.json else as_text)(lines))
+    print(as_json(lines) if config.json else verdict(lines))
     sys.exit(0 if is_well(lines) else 1)
 
 
@@ -48,7 +52,7 @@ def _parsed() -> InfoConfig:
     try:
         import draccus
     except Exception:
-        # It comes with LeRobot. Without it there is all the more to report, with one of the options.
+        # draccus comes with LeRobot. Without it the report is needed most, so one option is read here.
         return InfoConfig(json="--json=true" in sys.argv[1:])
     try:
         config = draccus.parse(InfoConfig)

@@ -6,10 +6,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from .probes import said_by
+from .probes import message_of
 
 OK = "ok"
-OPTIONAL = "optional"  # not here, and needed only for what the line says
+OPTIONAL = "optional"  # missing, but needed only for the feature that the line names
 PROBLEM = "problem"  # something essential is wrong
 
 
@@ -18,10 +18,10 @@ class Line:
     """One line of the report.
 
     Args:
-        name: What it is about.
-        value: What was found.
+        name: Its subject.
+        value: The finding.
         status: `OK`, `OPTIONAL` or `PROBLEM`.
-        remedy: What is wrong and what to do, if anything.
+        remedy: The fault and how to repair it; empty without a fault.
     """
 
     name: str
@@ -31,8 +31,8 @@ class Line:
 
 
 def line_or_reason(name: str, make: Callable[[], Line]) -> Line:
-    """The line, or one that says why it could not be made."""
+    """The line, or a line with the reason why it could not be made."""
     try:
         return make()
     except Exception as error:
-        return Line(name, "not known", PROBLEM, said_by(error))
+        return Line(name, "not known", PROBLEM, message_of(error))

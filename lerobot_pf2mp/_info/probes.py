@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can only be known by trying; each probe has a process of its own, for it may fail in any way.
+"""Probes: checks that try something out. Each runs in its own process, because it may crash.
 
 Usage: python probes.py NAME. Writes the answer as JSON, {"error": REASON} if there is none.
 """
@@ -27,29 +27,29 @@ EXTENSION = "_kernel_tree"
 
 _BALL = "<mujoco><worldbody><light pos='0 0 3'/><geom size='1'/></worldbody></mujoco>"
 _SIMULATIONS = ("PointMaze_UMaze-v3", "FetchReach-v4")
-_SIDE = 64  # of the pictures [pixels]
-_LONGEST = 300  # of what an error says [characters]
+_SIDE = 64  # side of the images [pixels]
+_LONGEST = 300  # longest message of an error [characters]
 
 
-def said_by(error: BaseException) -> str:
-    """Type and message of an error in one line of bounded length."""
+def message_of(error: BaseException) -> str:
+    """The type and message of an error, in one line of limited length."""
     words = " ".join([type(error).__name__ + ":" * bool(str(error)), *str(error).split()])
     return words if len(words) <= _LONGEST else words[: _LONGEST - 3] + "..."
 
 
 def discovery() -> dict[str, Any]:
-    """What LeRobot's commands find: our policies and environments; else what kept them from it."""
+    """Our policies and environments that LeRobot's commands find, and the errors if they find none."""
     from lerobot.utils.import_utils import register_third_party_plugins
 
     reasons = []
 
     class Reasons(logging.Handler):
-        """Keeps the errors of our import, which LeRobot logs and goes on without us."""
+        """Keeps the errors of our import. LeRobot only logs them and continues without this package."""
 
         def emit(self, record: logging.LogRecord) -> None:
             """Called for each message."""
             if record.exc_info and record.exc_info[1] and record.args == (DISTRIBUTION,):
-                reasons.append(said_by(record.exc_info[1]))
+                reasons.append(message_of(record.exc_info[1]))
 
     logging.getLogger().addHandler(Reasons())
     register_third_party_plugins()
@@ -66,7 +66,7 @@ def discovery() -> dict[str, Any]:
 
 
 def device() -> dict[str, Any]:
-    """Where torch computes."""
+    """The devices on which torch computes."""
     import torch
 
     answer: dict[str, Any] = {"cores": _n_cores(), "gpus": [], "said": "", "mps": False}
@@ -88,7 +88,7 @@ def device() -> dict[str, Any]:
 
 
 def simulation() -> dict[str, Any]:
-    """Which of the simulations that our environments are built on run; their errors by name."""
+    """The errors, by name, of the simulations on which our environments are built; an empty text without an error."""
     import gymnasium
     import gymnasium_robotics
 
@@ -102,12 +102,12 @@ def simulation() -> dict[str, Any]:
             env.close()
             errors[name] = ""
         except Exception as error:
-            errors[name] = said_by(error)
+            errors[name] = message_of(error)
     return {"errors": errors}
 
 
 def rendering() -> dict[str, Any]:
-    """How MuJoCo renders, found by rendering a picture in the way of our environments."""
+    """The backend with which MuJoCo renders. An image is rendered for it as in our environments."""
     with _headless().rendering():
         import mujoco
         from gymnasium.envs.mujoco.mujoco_rendering import OffScreenViewer
@@ -116,34 +116,34 @@ def rendering() -> dict[str, Any]:
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
         viewer = OffScreenViewer(model, data, _SIDE, _SIDE)
-        picture = viewer.render("rgb_array")
-        if picture.min() == picture.max():
-            raise RuntimeError("the picture of a ball is empty")
+        image = viewer.render("rgb_array")
+        if image.min() == image.max():
+            raise RuntimeError("the image of a ball is empty")
     return {"backend": viewer.backend}
 
 
 def video() -> dict[str, Any]:
-    """Which of the two encoders that LeRobot uses work: for films, and for datasets with pictures."""
+    """The errors of the two video encoders that LeRobot uses: for evaluation videos, and for datasets with images."""
     import av
     import numpy as np
 
     answer: dict[str, Any] = {"av": av.__version__, "encoders": {}}
     for encoder in ("libx264", "libsvtav1"):
         try:
-            with av.open(io.BytesIO(), "w", format="mp4") as film:
-                stream: Any = film.add_stream(encoder, rate=10)
+            with av.open(io.BytesIO(), "w", format="mp4") as file:
+                stream: Any = file.add_stream(encoder, rate=10)
                 stream.width, stream.height, stream.pix_fmt = _SIDE, _SIDE, "yuv420p"
-                picture = av.VideoFrame.from_ndarray(np.zeros((_SIDE, _SIDE, 3), np.uint8), format="rgb24")
-                for packet in [*stream.encode(picture), *stream.encode()]:
-                    film.mux(packet)
+                image = av.VideoFrame.from_ndarray(np.zeros((_SIDE, _SIDE, 3), np.uint8), format="rgb24")
+                for packet in [*stream.encode(image), *stream.encode()]:
+                    file.mux(packet)
             answer["encoders"][encoder] = ""
         except Exception as error:
-            answer["encoders"][encoder] = said_by(error)
+            answer["encoders"][encoder] = message_of(error)
     return answer
 
 
 def extension() -> dict[str, Any]:
-    """Whether the C extension has been built; one that cannot be loaded is an error."""
+    """Whether the C extension has been built. An extension that cannot be loaded is an error."""
     folder = _package_folder()
     files = [folder / "density" / f"{EXTENSION}{suffix}" for suffix in EXTENSION_SUFFIXES]
     built = [file for file in files if file.exists()]
@@ -193,16 +193,16 @@ def _module_from(path: Path, name: str) -> ModuleType:
 
 
 def _main(name: str) -> None:
-    # Whatever a library prints must not end up in the answer.
+    # Output of libraries must not get into the answer.
     with os.fdopen(os.dup(1), "w", encoding="utf-8") as output:
         os.dup2(2, 1)
-        # This folder, which LeRobot's commands do not have in their path.
+        # Removes this folder, which is not in the path of LeRobot's commands.
         if not getattr(sys.flags, "safe_path", False):
             del sys.path[0]
         try:
             answer = PROBES[name]()
         except BaseException as error:
-            answer = {"error": said_by(error)}
+            answer = {"error": message_of(error)}
         json.dump(answer, output)
 
 

@@ -4,66 +4,65 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from functools import partial
 
 from .line import PROBLEM, Line, line_or_reason
-from .probes import said_by
+from .probes import message_of
 from .trials import LINES, train_line, trial_line
 from .versions import EXTRAS, PACKAGES, extra_line, package_line, python_line, ranges
 
+# Width of a value in the table [characters], for nearly all of them. It is not measured, so that no line waits for others.
+_VALUE_WIDTH = 34
 
-def gather(seconds: float) -> list[Line]:
-    """Everything there is to say; what cannot be found out says why.
+
+def gather(seconds: float) -> Iterator[Line]:
+    """Makes the lines of the report, each as soon as it is known. A line that cannot be made contains the reason.
 
     Args:
-        seconds: Longest that each trial may take [s].
+        seconds: Largest duration of each trial [s].
     """
     with ThreadPoolExecutor() as pool:
         trials = [pool.submit(line_or_reason, name, partial(trial_line, name, seconds)) for name in LINES]
-        packages, extras = _version_lines()
-        train = line_or_reason("lerobot-train", train_line)
-        return [*packages, train, *(trial.result() for trial in trials), *extras]
+        yield from _version_lines()
+        yield line_or_reason("lerobot-train", train_line)
+        yield from (trial.result() for trial in trials)
 
 
 def is_well(lines: Sequence[Line]) -> bool:
-    """Whether nothing essential is wrong."""
+    """Whether no line names a problem."""
     return all(line.status != PROBLEM for line in lines)
 
 
-def as_text(lines: Sequence[Line]) -> str:
-    """A table with what to do at the end of its lines."""
-    name_width = max(len(line.name) for line in lines)
-    value_width = max(len(line.value) for line in lines)
-    rows = [
-        f"{line.name:{name_width}}  {line.value:{value_width}}  {line.status}{line.remedy and ': '}{line.remedy}"
-        for line in lines
-    ]
+def as_row(line: Line) -> str:
+    """A line of the report as a row of a table, with the remedy at its end."""
+    name_width = max(map(len, (*PACKAGES, *EXTRAS, *LINES)))
+    remedy = f": {line.remedy}" if line.remedy else ""
+    return f"{line.name:{name_width}}  {line.value:{_VALUE_WIDTH}}  {line.status}{remedy}"
+
+
+def verdict(lines: Sequence[Line]) -> str:
+    """The last row: how many lines name a problem."""
     n_problems = sum(line.status == PROBLEM for line in lines)
-    verdict = f"{n_problems} of {len(lines)} lines name a problem." if n_problems else "No problem found."
-    return "\n".join([*rows, verdict])
+    return f"{n_problems} of {len(lines)} lines name a problem." if n_problems else "No problem found."
 
 
 def as_json(lines: Sequence[Line]) -> str:
-    """The same for programs and issue reports."""
+    """The report as JSON, for programs and issue reports."""
     return json.dumps({"ok": is_well(lines), "lines": [asdict(line) for line in lines]}, indent=2)
 
 
-def _version_lines() -> tuple[list[Line], list[Line]]:
-    """Lines of the packages, and of the extras."""
-    lines = []
+def _version_lines() -> Iterator[Line]:
+    """The lines of the packages, and those of the extras."""
     try:
         wanted = ranges()
     except Exception as error:
         wanted = {}
-        lines.append(Line("version ranges", "not checked", PROBLEM, said_by(error)))
-    lines.append(line_or_reason("python", lambda: python_line(wanted.get("python"))))
+        yield Line("version ranges", "not checked", PROBLEM, message_of(error))
+    yield line_or_reason("python", lambda: python_line(wanted.get("python")))
     for name in PACKAGES:
-        lines.append(line_or_reason(name, partial(package_line, name, wanted.get(name))))
-    extras = [
-        line_or_reason(purpose, partial(extra_line, purpose, wanted.get(package)))
-        for purpose, (package, _, _) in EXTRAS.items()
-    ]
-    return lines, extras
+        yield line_or_reason(name, partial(package_line, name, wanted.get(name)))
+    for purpose, (package, _, _) in EXTRAS.items():
+        yield line_or_reason(purpose, partial(extra_line, purpose, wanted.get(package)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs the probes and says what their answers mean."""
+"""Runs the probes and turns their answers into lines."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _BACKENDS = {"egl": "EGL", "osmesa": "OSMesa", "glfw": "screen"}
 
 
 def answer_of(probe: str, seconds: float) -> dict[str, Any]:
-    """What a probe says in a process of its own; {"error": REASON} if it fails in any way or takes longer."""
+    """Runs a probe in its own process and returns its answer; {"error": REASON} if it fails or takes longer."""
     try:
         finished = subprocess.run(
             [sys.executable, "-X", "faulthandler", probes.__file__, probe],
@@ -42,7 +42,7 @@ def answer_of(probe: str, seconds: float) -> dict[str, Any]:
 
 
 def discovery_line(answer: dict[str, Any]) -> Line:
-    """Whether LeRobot's commands find this package; if not, why."""
+    """Whether LeRobot's commands find this package; if not, the reason."""
     if "error" in answer:
         return _not_found(f"LeRobot's discovery does not run: {answer['error']}")
     policies, environments = answer["policies"], answer["environments"]
@@ -60,7 +60,7 @@ def discovery_line(answer: dict[str, Any]) -> Line:
 
 
 def device_line(answer: dict[str, Any]) -> Line:
-    """Where policies are trained and run."""
+    """The device on which policies are trained and run."""
     if "error" in answer:
         remedy = "install a torch that runs here (pytorch.org/get-started/locally)"
         return Line("device", "torch does not compute", PROBLEM, f"{answer['error']}: {remedy}")
@@ -76,7 +76,7 @@ def device_line(answer: dict[str, Any]) -> Line:
 
 
 def extension_line(answer: dict[str, Any]) -> Line:
-    """Whether potential fields are looked up by the C extension, on a CPU."""
+    """Whether the C extension evaluates potential fields on a CPU."""
     remedy = "fields are slower on a CPU: install a C compiler, then pip install --force-reinstall --no-deps . in its folder"
     if "error" in answer:
         return Line("extension", "cannot be loaded", OPTIONAL, f"{answer['error']}: {remedy}")
@@ -96,15 +96,15 @@ def simulation_line(answer: dict[str, Any]) -> Line:
 
 
 def rendering_line(answer: dict[str, Any]) -> Line:
-    """Which backend renders."""
+    """The backend that renders."""
     if "error" in answer:
         remedy = _without("MUJOCO_GL", "DISPLAY") + answer["error"]
-        return Line("rendering", "no pictures of Fetch and handwriting", OPTIONAL, remedy)
+        return Line("rendering", "no images of Fetch and handwriting", OPTIONAL, remedy)
     return Line("rendering", _BACKENDS.get(answer["backend"], answer["backend"]))
 
 
 def video_line(answer: dict[str, Any]) -> Line:
-    """Whether films can be written."""
+    """Whether videos can be written."""
     if "error" in answer:
         return Line(
             "video", "does not work", OPTIONAL, f'{answer["error"]}: pip install "lerobot[evaluation]"'
@@ -148,13 +148,13 @@ def train_line() -> Line:
 
 
 def _without(*variables: str) -> str:
-    """The advice to try without those of these variables that are set."""
+    """The advice to try again without those of the variables that are set."""
     chosen = " and ".join(name for name in variables if os.environ.get(name))
     return f"try without {chosen}: " if chosen else ""
 
 
 def _interpreter_of(script: Path) -> Path | None:
-    """The Python in a script's first line, if one is named there; it is not in a launcher's."""
+    """The Python interpreter in the first line of a script; None if there is none, as in a binary launcher."""
     with script.open("rb") as file:
         first = file.readline().decode("utf-8", "replace").strip()
     interpreter = Path(first[2:].strip())

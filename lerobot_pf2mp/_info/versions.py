@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which versions are installed, and which this package and LeRobot ask for."""
+"""The installed versions, and the versions that this package and LeRobot require."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PACKAGES = (
     "minari",
     "accelerate",
 )
-# what it is for: (package, the distribution that asks for it, with which extra)
+# purpose: (package, the distribution that requires it, the extra with which it requires it)
 EXTRAS = {
     "experts": ("stable-baselines3", DISTRIBUTION, "experts"),
     "async (grpc)": ("grpcio", DISTRIBUTION, "async"),
@@ -38,10 +38,10 @@ EXTRAS = {
 
 
 def ranges() -> dict[str, SpecifierSet]:
-    """The versions that this package asks for, and those that LeRobot asks for in turn, by name; "python" is one.
+    """The versions that this package and LeRobot require, by name. "python" is one of the names.
 
     Raises:
-        ImportError: If packaging, with which they are read, is missing.
+        ImportError: If packaging, which reads them, is missing.
     """
     from packaging.requirements import Requirement
     from packaging.specifiers import SpecifierSet
@@ -68,7 +68,7 @@ def ranges() -> dict[str, SpecifierSet]:
 
 
 def python_line(wanted: SpecifierSet | None) -> Line:
-    """The interpreter, and whether this package runs with it."""
+    """The Python version, and whether this package runs with it."""
     found = platform.python_version()
     value = f"{found}, {platform.system()} {platform.machine()}"
     if _is_in(wanted, found):
@@ -77,7 +77,7 @@ def python_line(wanted: SpecifierSet | None) -> Line:
 
 
 def package_line(name: str, wanted: SpecifierSet | None) -> Line:
-    """A package without which something of this one does not run."""
+    """A required package: its version, and whether it is in range."""
     found = _version(name)
     remedy = f'pip install "{name}{wanted or ""}"' if name != DISTRIBUTION else "pip install . in its folder"
     if found is None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Notes what a vectorised environment reports of every episode; LeRobot's evaluation keeps rewards and success only."""
+"""Records the info of every episode of a vectorised environment. LeRobot's evaluation keeps only rewards and success."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-# What an environment's info may hold, and what of it stands for a whole episode.
+# The keys of an environment's info that are recorded, and how the values of all steps are combined.
 _OVER_STEPS: dict[str, Callable[[float, float], float]] = {
     "is_collision": max,
     "is_plan_in_wall": max,
@@ -22,7 +22,7 @@ _OVER_STEPS: dict[str, Callable[[float, float], float]] = {
 
 @dataclass(frozen=True)
 class Episode:
-    """What happened in one episode. Numbers that the environment does not report are None.
+    """The outcome of one episode. Numbers that the environment does not report are None.
 
     Args:
         collision: Whether there was a collision (``is_collision`` of any step in the environment's info).
@@ -42,10 +42,10 @@ class Episode:
 
 
 class EpisodeRecorder(gym.vector.VectorWrapper):
-    """A vectorised environment that remembers its episodes.
+    """A vectorised environment that records its episodes.
 
     Args:
-        env: The environment, whose sub-environments stay as they are once their episode has ended.
+        env: The environment. Its sub-environments must not change after the end of their episode.
     """
 
     def __init__(self, env: gym.vector.VectorEnv) -> None:
@@ -58,35 +58,34 @@ class EpisodeRecorder(gym.vector.VectorWrapper):
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") or name == "env":
             raise AttributeError(name)
-        return getattr(
-            self.env, name
-        )  # `call` and `envs`, which LeRobot uses, are not passed on by Gymnasium
+        # Gymnasium's wrapper does not forward `call` and `envs`, which LeRobot uses.
+        return getattr(self.env, name)
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
-        """Starts the next episodes; those before are taken as finished."""
+        """Starts the next episodes. The episodes before count as finished."""
         self._finish()
         observation, info = self.env.reset(**kwargs)
         self._steps[:] = 0
         self._ended[:] = False
         self._reported = [{} for _ in range(self.num_envs)]
-        self._note(info)
+        self._record(info)
         return observation, info
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Steps all sub-environments; those whose episode has ended are not recorded any more."""
+        """Steps all sub-environments; a sub-environment is not recorded after the end of its episode."""
         observation, reward, terminated, truncated, info = self.env.step(actions)
         self._steps += ~self._ended
-        self._note(info)
+        self._record(info)
         self._ended |= np.asarray(terminated) | np.asarray(truncated)
         return observation, reward, terminated, truncated, info
 
     def take_episodes(self, n_episodes: int) -> list[Episode]:
-        """The first episodes since the last call, in the order of the sub-environments of each rollout."""
+        """Returns the first episodes since the last call, in the order of the sub-environments of each rollout."""
         self._finish()
         episodes, self._finished = self._finished[:n_episodes], []
         return episodes
 
-    def _note(self, info: dict[str, Any]) -> None:
+    def _record(self, info: dict[str, Any]) -> None:
         for key, combine in _OVER_STEPS.items():
             values = info.get(key)
             if values is None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evaluates a policy on a benchmark's episodes, one repeat at a time. Evaluation is LeRobot's own."""
+"""Evaluates a policy on a benchmark's episodes, one repeat at a time, with LeRobot's own evaluation."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ _N_LATENCY_CALLS = 11
 
 
 def evaluate_all(spec: BenchmarkSpec, jobs: Sequence[Job], n_processes: int) -> Iterator[list[EpisodeRow]]:
-    """The rows of each job, in the jobs' order.
+    """Evaluates all jobs. Yields the rows of each job, in the order of the jobs.
 
     Args:
-        spec: What is compared.
+        spec: The benchmark.
         jobs: Its repeats.
-        n_processes: Processes side by side. With more than one, each uses one thread.
+        n_processes: Number of parallel processes. With more than one, each uses one thread.
     """
     commit = _commit()
     if n_processes == 1:
@@ -57,7 +57,7 @@ def _commit() -> str:
 
 
 class _Evaluator:
-    """Evaluates jobs one after the other, keeping the last policy and environment for the next one."""
+    """Evaluates jobs one after the other. It keeps the last policy and environment for the next job."""
 
     def __init__(self, spec: BenchmarkSpec, commit: str) -> None:
         self._spec = spec
@@ -66,7 +66,7 @@ class _Evaluator:
         self._make_env = lru_cache(maxsize=1)(self._make_vector_env)
 
     def __call__(self, job: Job) -> list[EpisodeRow]:
-        """The rows of a job's episodes."""
+        """Evaluates a job and returns the rows of its episodes."""
         spec = self._spec
         policy, preprocessor, postprocessor = self._load(job.checkpoint, job.variant)
         env_config, env = self._make_env(job.task)
@@ -76,10 +76,8 @@ class _Evaluator:
                 policy.config.guidance_integrator = job.guidance.integrator
         env_preprocessor, env_postprocessor = make_env_pre_post_processors(env_config, policy.config)
         latency = _measure_latency(env, policy, env_preprocessor, preprocessor, spec.episode_seed)
-        with (
-            seeded_prior_noise(policy, job.repeat),
-            redirect_stderr(io.StringIO()),
-        ):  # LeRobot's own progress bars
+        # stderr gets LeRobot's own progress bars.
+        with seeded_prior_noise(policy, job.repeat), redirect_stderr(io.StringIO()):
             outcomes = eval_policy(
                 env,
                 policy,
@@ -150,7 +148,7 @@ def _measure_latency(
     preprocessor: Any,
     episode_seed: int,
 ) -> float:
-    """Median time of a call that plans a new chunk for one robot [ms]."""
+    """The median time of a call that generates a new chunk for one robot [ms]."""
     policy.eval()
     observation, _ = env.reset(
         seed=[episode_seed + i for i in range(env.num_envs)], options={NEW_ROLLOUT_OPTION: True}
@@ -166,7 +164,7 @@ def _measure_latency(
             policy.select_action(dict(observation))
         _wait_for(policy)
         times.append(time.perf_counter() - began)
-    return round(1000 * statistics.median(times[1:]), 3)  # the first one also warms up
+    return round(1000 * statistics.median(times[1:]), 3)  # the first call is a warm-up
 
 
 def _wait_for(policy: PreTrainedPolicy) -> None:

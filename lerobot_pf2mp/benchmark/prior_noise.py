@@ -16,11 +16,11 @@ from lerobot.policies import PreTrainedPolicy
 def seeded_prior_noise(policy: PreTrainedPolicy, repeat: int) -> Iterator[None]:
     """Seeds the noise of every chunk by repeat, rollout and chunk.
 
-    Policies that draw noise of the same shape first thing in `predict_action_chunk`, as flow matching and diffusion
+    Policies that draw noise of the same shape at the beginning of `predict_action_chunk`, as flow matching and diffusion
     policies do, then start from the same samples. A rollout begins with the policy's `reset`.
 
     Args:
-        policy: The policy; it is as before at the end.
+        policy: The policy; it is unchanged after the block.
         repeat: Number of the repeat.
     """
     reset, predict = policy.reset, policy.predict_action_chunk

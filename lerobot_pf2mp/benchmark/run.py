@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compares policies on the same episodes: tasks x policies x guidance x training seeds x repeats, one row an episode.
+"""Compares policies on the same episodes: tasks x policies x guidance x training seeds x repeats, one row per episode.
 
 Every policy gets the same start-goal pairs and, in each repeat, the same prior noise, so that policies can be compared
-pair by pair. Evaluation is LeRobot's own, on vectorised environments.
+pair by pair. The evaluation is LeRobot's own, on vectorised environments.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ from lerobot_pf2mp.results.rows import EpisodeRow, SummaryRow, format_row, read_
 from lerobot_pf2mp.results.summary import group_cells, summarise
 from lerobot_pf2mp.results.tables import make_latex, make_markdown
 
-# What a guided policy is called when guidance is off.
+# Names of guided policies when guidance is off.
 UNGUIDED_NAMES = {"pf2mp": "fmp", "dppf": "dp"}
 
 
 def run_benchmark(spec: BenchmarkSpec, output_dir: Path, *, n_processes: int = 1) -> list[SummaryRow]:
     """Evaluates all policies and writes ``episodes.csv``, ``summary.csv``, ``table.md``, ``table.tex`` and ``run.json``.
 
-    A benchmark that was interrupted goes on where it was; more policies, guidance, variants, seeds or repeats are added to
-    those already there.
+    An interrupted benchmark continues where it stopped. More policies, guidance, variants, seeds or repeats are added to the
+    existing results.
 
     Args:
-        spec: What to compare.
-        output_dir: Where results are written.
-        n_processes: Processes side by side. With more than one, each uses one thread.
+        spec: The benchmark.
+        output_dir: Folder of the results.
+        n_processes: Number of parallel processes. With more than one, each uses one thread.
 
     Returns:
         One row for each policy, kind of guidance and repeat.
@@ -59,7 +59,7 @@ def run_benchmark(spec: BenchmarkSpec, output_dir: Path, *, n_processes: int = 1
     rows = read_rows(episodes, EpisodeRow) if episodes.exists() else []
     _refuse_other_checkpoints(rows, jobs, output_dir)
     _claim(output_dir, spec)
-    # Repeats that a kill has cut short are made anew.
+    # Repeats that were cut short by a kill are run again.
     counts = Counter(map(_identify, rows))
     done = {key for key, count in counts.items() if count == spec.n_episodes}
     write_rows(episodes, [row for row in rows if _identify(row) in done], EpisodeRow)
@@ -84,11 +84,11 @@ def run_benchmark(spec: BenchmarkSpec, output_dir: Path, *, n_processes: int = 1
 def _make_jobs(spec: BenchmarkSpec) -> list[Job]:
     jobs = []
     for task in spec.tasks:
-        replace(spec.env, task=task)  # an unknown task is an error now rather than in the middle
+        replace(spec.env, task=task)  # raises an error for an unknown task now, not later
         for name, template in spec.policies.items():
             for seed in spec.seeds:
                 checkpoint = template.replace("{task}", task).replace("{seed}", str(seed))
-                # Options that do not exist are an error now rather than in the middle.
+                # This raises an error for unknown options now, not later.
                 configs = [load_config(checkpoint, **options) for options in spec.variants.values()]
                 is_guided = isinstance(configs[0], GuidedConfig)
                 guidances = spec.guidances if is_guided else (NONE,)
@@ -112,7 +112,7 @@ def _make_jobs(spec: BenchmarkSpec) -> list[Job]:
     for job, count in names.items():
         if count > 1:
             raise ValueError(
-                f"every policy must have a name of its own, got {job.policy!r} twice (guidance {job.guidance.integrator})"
+                f"every policy must have its own name, got {job.policy!r} twice (guidance {job.guidance.integrator})"
             )
     return jobs
 
@@ -126,7 +126,7 @@ def _identify(row: Job | EpisodeRow) -> tuple[object, ...]:
 
 
 def _refuse_other_checkpoints(rows: Sequence[EpisodeRow], jobs: Sequence[Job], output_dir: Path) -> None:
-    """Rows of two checkpoints under one name would be counted together."""
+    """Checks that each name has one checkpoint, because rows of two checkpoints with one name would be counted together."""
     found = {(row.task, row.policy, row.seed): row.checkpoint for row in rows}
     for job in jobs:
         checkpoint = found.get((job.task, job.policy, job.seed), job.checkpoint)
@@ -138,7 +138,7 @@ def _refuse_other_checkpoints(rows: Sequence[EpisodeRow], jobs: Sequence[Job], o
 
 
 def _claim(output_dir: Path, spec: BenchmarkSpec) -> None:
-    """Marks the folder as a benchmark over these episodes, so that a later call can only go on with the same ones."""
+    """Marks the folder as a benchmark over these episodes, so that a later call can only continue with the same ones."""
     mark = output_dir / "run.json"
     episodes = {
         "env": {

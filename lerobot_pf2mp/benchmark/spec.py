@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a benchmark compares."""
+"""The specification of a benchmark."""
 
 from __future__ import annotations
 
@@ -51,21 +51,22 @@ NONE = Guidance(NO_GUIDANCE, 0.0)
 
 @dataclass(frozen=True)
 class BenchmarkSpec:
-    """What to compare.
+    """The policies, guidance, tasks and episodes of a benchmark.
 
     Args:
         env: The environments' configuration.
-        tasks: Its tasks.
+        tasks: Tasks of the environment.
         policies: Checkpoints (``pretrained_model`` folders or repositories on the Hub) by name. ``{task}`` and ``{seed}``
             in a path stand for the task and the training seed. Policies of any type can be compared.
-        guidances: Kinds of guidance for policies that have one. ``none`` is their unguided twin.
-        variants: Changes to the policies' configuration by name; the name "" with no changes is the checkpoint as it is.
+        guidances: Kinds of guidance for policies that have one. ``none`` is the same policy without
+            guidance.
+        variants: Changes to the policies' configuration by name; the name "" without changes is the unchanged checkpoint.
         seeds: Training seeds.
         n_repeats: Repeats with other prior noise.
-        n_episodes: Start-goal pairs, the same for all.
+        n_episodes: Number of start-goal pairs, the same pairs for all.
         episode_seed: Seed of the first pair; pair i has `episode_seed` + i.
-        batch_size: Environments that run side by side.
-        device: Where the policies run.
+        batch_size: Number of parallel environments.
+        device: Device on which the policies run.
 
     Raises:
         ValueError: If a number is not positive, there is nothing to compare, or something would be compared twice.
@@ -107,12 +108,12 @@ class BenchmarkSpec:
 
 @dataclass(frozen=True)
 class Job:
-    """One repeat of one policy with one kind of guidance: the unit that is done or not done.
+    """One repeat of one policy with one kind of guidance. It is evaluated as a whole or not at all.
 
     Args:
         task: The environment's task.
-        policy: Name of the policy, or of its unguided twin.
-        checkpoint: Where it is loaded from.
+        policy: Name of the policy; without guidance its unguided name.
+        checkpoint: Folder or repository from which it is loaded.
         guidance: The kind of guidance.
         variant: Name of the changes to its configuration.
         seed: Training seed.

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The commands: each parses its options, calls one function and says in one line what came out."""
+"""The commands. Each parses its options, calls one function and prints the result in one line."""

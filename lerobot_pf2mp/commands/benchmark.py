@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 class BenchmarkConfig:
     """Compares policies on the same start-goal pairs and the same prior noise; writes CSV files and tables.
 
-    Called again, it goes on where it was interrupted, or adds what is new. Checkpoints are named by the training seed and
-    task: {seed} and {task} in a path are replaced. Policies without guidance, also those of LeRobot itself, are evaluated
-    once for each seed and repeat; pf2mp and dppf policies once more for each kind of guidance.
+    Called again, it continues where it was interrupted, or adds new results. {seed} and {task} in the path of a checkpoint
+    are replaced by the training seed and the task. Policies without guidance, also those of LeRobot itself, are evaluated
+    once for each seed and repeat; pf2mp and dppf policies once for each kind of guidance.
 
     Examples:
         pf2mp-benchmark --policies='{pf2mp: outputs/maze_large/checkpoints/last/pretrained_model}' \
@@ -33,9 +33,9 @@ class BenchmarkConfig:
 
     # Checkpoints by name: pretrained_model folders or repositories on the Hub, of any LeRobot policy.
     policies: dict[str, str] = field(default_factory=dict)
-    # The environment and how it is run.
+    # The environment and its options.
     env: EnvConfig = field(default_factory=PF2MPMazeEnv)
-    # Its tasks; by default the environment's one.
+    # Tasks of the environment; by default its own one.
     tasks: list[str] = field(default_factory=list)
     # Kinds of guidance: none, or INTEGRATOR:LAMBDA,LAMBDA,...
     guidance: list[str] = field(default_factory=lambda: ["none", "proximal:0.8"])
@@ -49,11 +49,11 @@ class BenchmarkConfig:
     n_episodes: int = 500
     # Seed of the first pair; pair i has this seed + i.
     episode_seed: int = 100000
-    # Environments that run side by side.
+    # Number of parallel environments.
     batch_size: int = 50
-    # Where the policies run.
+    # Device on which the policies run.
     device: str = "cpu"
-    # Processes side by side, with one thread each; 1 uses all threads in one process.
+    # Number of parallel processes, with one thread each; 1 uses all threads in one process.
     n_processes: int = 1
     # Folder of episodes.csv, summary.csv, table.md, table.tex and run.json.
     output_dir: Path = Path("outputs/benchmark")
@@ -69,7 +69,7 @@ def main(config: BenchmarkConfig) -> None:
 
 
 def make_spec(config: BenchmarkConfig) -> BenchmarkSpec:
-    """What to compare, as `run_benchmark` wants it."""
+    """The specification of the benchmark for `run_benchmark`."""
     from lerobot_pf2mp.benchmark.spec import BenchmarkSpec, Guidance
 
     return BenchmarkSpec(

@@ -38,7 +38,7 @@ class CollectConfig(WritingConfig):
         pf2mp-collect --task=handwriting_pen --scene_file=my_stroke.json --root=data/my_stroke
     """
 
-    # What to demonstrate: maze_umaze, maze_medium, maze_large, fetch_reach, fetch_push, handwriting_joint or
+    # Task to demonstrate: maze_umaze, maze_medium, maze_large, fetch_reach, fetch_push, handwriting_joint or
     # handwriting_pen.
     task: str = "maze_large"
     # Folder of the dataset; by default where LeRobot keeps the datasets of your Hub account.
@@ -50,26 +50,26 @@ class CollectConfig(WritingConfig):
     n_episodes: int | None = None
     # Steps that each demonstration is resampled to; by default 80 for a maze, 48 for Fetch, 64 for handwriting.
     n_steps: int | None = None
-    # Mazes: standard deviation of the noise on the expert's force, of which 1 is the largest (100 N).
+    # Mazes: standard deviation of the noise on the expert's force, relative to the largest force (100 N).
     action_noise: float = 0.0
-    # Mazes: a map of your own instead of the task's: rows of 0 (free) and 1 (wall) separated by "/".
+    # Mazes: your own map instead of the task's: rows of 0 (free) and 1 (wall) separated by "/".
     maze_map: str | None = None
-    # Fetch: scripted, or the folder of an expert trained by pf2mp-train-expert, in the same scene.
+    # Fetch: scripted, or the folder of an expert that pf2mp-train-expert trained in the same scene.
     expert: str = "scripted"
-    # Fetch: how near the scripted expert comes to the wall: clear keeps away, hug passes close by.
+    # Fetch: distance of the scripted expert to the wall: clear (2 to 5 cm) or hug (2 to 10 mm).
     style: str = "clear"
-    # Fetch: the wall, and where the gripper, the goal and the block are placed.
+    # Fetch: the wall, and the ranges of positions of the gripper, the goal and the block.
     scene: SceneConfig = field(default_factory=SceneConfig)
-    # state, or pixels_agent_pos: a camera's pictures are recorded as a video instead of what else the policy is told about
-    # goal and block. For the environment: --env.obs_type and --env.render_size.
+    # state, or pixels_agent_pos: camera images are recorded as a video instead of the positions of goal and block. Evaluate
+    # such policies with the same --env.obs_type and --env.render_size.
     obs_type: str = "state"
-    # Width of these pictures, for a maze their longer side [pixels].
-    picture_width: int = 128
-    # Fetch: processes side by side.
+    # Width of these images, for a maze their longer side [pixels].
+    image_width: int = 128
+    # Fetch: number of parallel processes.
     n_processes: int = 1
-    # Seed of everything random.
+    # Seed of all random numbers.
     seed: int = 0
-    # Whether to replace a dataset that is already there.
+    # Whether to replace an existing dataset.
     overwrite: bool = False
     # Whether to publish the dataset on the Hugging Face Hub under the name --repo_id. You must be logged in there.
     push_to_hub: bool = False
@@ -99,8 +99,8 @@ def _collect(config: CollectConfig) -> None:
         raise ValueError(f"task must be one of {tasks}, got {config.task!r}")
 
 
-def _picture_width(config: CollectConfig) -> int | None:
-    return None if config.obs_type == "state" else config.picture_width
+def _image_width(config: CollectConfig) -> int | None:
+    return None if config.obs_type == "state" else config.image_width
 
 
 def _collect_maze(config: CollectConfig) -> None:
@@ -114,7 +114,7 @@ def _collect_maze(config: CollectConfig) -> None:
         maze_of(config.task, config.maze_map),
         n_episodes=4000 if config.n_episodes is None else config.n_episodes,
         action_noise=config.action_noise,
-        picture_width=_picture_width(config),
+        image_width=_image_width(config),
         seed=config.seed,
     )
     write_and_report(config, "maze" if config.maze_map else config.task, MAZE_STEPS, write)
@@ -128,7 +128,7 @@ def _collect_fetch(config: CollectConfig, task: str) -> None:
         task,
         n_episodes=1000 if config.n_episodes is None else config.n_episodes,
         style=config.style,
-        picture_width=_picture_width(config),
+        image_width=_image_width(config),
         scene_changes=asdict(config.scene),
         seed=config.seed,
         n_processes=config.n_processes,
@@ -148,7 +148,7 @@ def _collect_handwriting(config: CollectConfig, space: str) -> None:
         space,
         n_episodes=default if config.n_episodes is None else config.n_episodes,
         scene_options=config.scene_options,
-        picture_width=_picture_width(config),
+        image_width=_image_width(config),
         seed=config.seed,
     )
     write_and_report(config, config.task, HANDWRITING_STEPS, write)

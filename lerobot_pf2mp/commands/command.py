@@ -63,7 +63,7 @@ def given[T](option: str, value: T | None) -> T:
     return value
 
 
-def dataset_place(repo_id: str | None, root: Path | None, name: str) -> tuple[str, Path]:
+def dataset_name_and_root(repo_id: str | None, root: Path | None, name: str) -> tuple[str, Path]:
     """Name and folder of a dataset; by default local/NAME, and where LeRobot keeps datasets."""
     from lerobot.utils.constants import HF_LEROBOT_HOME
 
@@ -91,7 +91,7 @@ def write_and_report(
         n_steps: Steps of an episode, unless the options say otherwise.
         write: Is given root, repo_id, n_steps and overwrite; returns the number of episodes, and by reason those left out.
     """
-    repo_id, root = dataset_place(options.repo_id, options.root, name)
+    repo_id, root = dataset_name_and_root(options.repo_id, options.root, name)
     n_steps = n_steps if options.n_steps is None else options.n_steps
     n_episodes, dropped = write(root=root, repo_id=repo_id, n_steps=n_steps, overwrite=options.overwrite)
     left_out = ", ".join(f"{count} {reason}" for reason, count in dropped.items()) or "none"

@@ -16,7 +16,7 @@ from lerobot_pf2mp.envs.tasks import FETCH_OF_TASK, FETCH_STEPS, HANDWRITING_STE
 
 @dataclass
 class SourceConfig:
-    """Where recorded demonstrations come from."""
+    """The source of recorded demonstrations."""
 
     # Layout of the recording: d4rl (maze2d, one HDF5 file), minari (pointmaze, a folder), fetch (gymnasium-robotics'
     # FetchReach or FetchPush: an npz file, or the folder of a Minari dataset) or handwriting (a CSV or JSON file, or the
@@ -24,7 +24,7 @@ class SourceConfig:
     type: str = "d4rl"
     # The file or folder.
     path: Path | None = None
-    # Handwriting: seven angles to add to the recorded joints [rad], where the arm's zero positions are others:
+    # Handwriting: seven angles to add to the recorded joints [rad], if the arm has other zero positions:
     # [0,0,0,0,0,-1.5708,-0.7854] for a real Panda.
     joint_offsets: list[float] = field(default_factory=list)
 
@@ -45,34 +45,34 @@ class ConvertConfig(WritingConfig):
 --scene_file=my_stroke.json --root=data/mine
 
     npz files of Fetch hold, without pickles, observation (E, T+1, 10 for Reach or 25 for Push) and desired_goal (E, T+1 or
-    T, 3) of E episodes. Or they hold the rows of all episodes, observation (N, 10 or 25) and desired_goal (N, 3), with
-    episode_ends (E), the row after each episode's last, or terminals and timeouts (N), true in each episode's last row. An
-    observation begins with the gripper's position, for Push followed by the block's [m]; an episode's last desired goal is
-    its goal. Episodes that do not end within 0.05 m of it are left out.
+    T, 3) of E episodes. Or they hold the rows of all episodes: observation (N, 10 or 25) and desired_goal (N, 3), with
+    episode_ends (E), the row after each episode's last row, or terminals and timeouts (N), true in each episode's last row.
+    An observation begins with the gripper's position, for Push followed by the block's [m]. The last desired goal of an
+    episode is its goal. Episodes that do not end within 0.05 m of it are left out.
 
     CSV files of handwriting have columns time [s], optionally episode, and joint_1 to joint_7 [rad], optionally finger_1
     and finger_2 [m], or x and y of the pen [m]. JSON files are {"episodes": [{"time": [...], "joints": [[7 or 9], ...]}]} or
-    "pen": [[x, y], ...] instead. Of a LeRobotDataset the actions are taken: 7 joints, or 7 joints and 2 fingers.
+    "pen": [[x, y], ...] instead. Of a LeRobotDataset the actions are used: 7 joints, or 7 joints and 2 fingers.
     """
 
     # The recording.
     source: SourceConfig = field(default_factory=SourceConfig)
-    # What was recorded: maze_umaze, maze_medium, maze_large, fetch_reach, fetch_push, handwriting_joint or
+    # Recorded task: maze_umaze, maze_medium, maze_large, fetch_reach, fetch_push, handwriting_joint or
     # handwriting_pen. Episodes that touch its walls or enter its regions are left out.
     task: str = "maze_large"
     # Folder of the dataset; by default where LeRobot keeps the datasets of your Hub account.
     root: Path | None = None
     # Name of the dataset, user/name; by default local/TASK.
     repo_id: str | None = None
-    # Most episodes to write; all by default.
+    # Largest number of episodes to write; all by default.
     n_episodes: int | None = None
     # Steps that each episode is resampled to; by default 80 for a maze, 48 for Fetch, 64 for handwriting.
     n_steps: int | None = None
-    # Mazes: a map of your own instead of the task's: rows of 0 (free) and 1 (wall) separated by "/".
+    # Mazes: your own map instead of the task's: rows of 0 (free) and 1 (wall) separated by "/".
     maze_map: str | None = None
-    # Fetch: where the wall is; the ranges only have to leave places clear of it.
+    # Fetch: the wall. The ranges are only checked: they must contain positions clear of it.
     scene: SceneConfig = field(default_factory=SceneConfig)
-    # Whether to replace a dataset that is already there.
+    # Whether to replace an existing dataset.
     overwrite: bool = False
     # Whether to publish the dataset on the Hugging Face Hub under the name --repo_id. You must be logged in there.
     push_to_hub: bool = False

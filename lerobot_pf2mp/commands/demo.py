@@ -9,20 +9,20 @@ from pathlib import Path
 
 @dataclass
 class DemoConfig:
-    """Runs the main job: demonstrations, training, evaluation with guidance off and on, a table and a figure.
+    """Runs the whole pipeline: demonstrations, training, evaluation with guidance off and on, a table and a figure.
 
-    Stages that are done are skipped, so that the command can be interrupted and called again.
+    Finished stages are skipped, so the command can be interrupted and called again.
 
     Examples:
         pf2mp-demo --output_dir=demo
         pf2mp-demo --output_dir=demo_medium --task=maze_medium --steps=1000
     """
 
-    # Folder of everything the demo writes.
+    # Folder of all files that the demo writes.
     output_dir: Path = Path("demo")
     # maze_umaze, maze_medium or maze_large.
     task: str = "maze_large"
-    # Demonstrations.
+    # Number of demonstrations.
     n_demonstrations: int = 4000
     # Training steps of 64 trajectories.
     steps: int = 2000

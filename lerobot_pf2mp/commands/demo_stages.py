@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The main job from end to end: demonstrations, training, evaluation without and with guidance, table and figure."""
+"""The whole pipeline: demonstrations, training, evaluation without and with guidance, table and figure."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ def run_demo(
     """Runs all stages that are not done yet and prints the result.
 
     Args:
-        output_dir: Folder of everything that is written.
+        output_dir: Folder of all files that are written.
         task: maze_umaze, maze_medium or maze_large.
-        n_demonstrations: Demonstrations to collect.
+        n_demonstrations: Number of demonstrations to collect.
         steps: Training steps.
-        n_episodes: Evaluation episodes for each policy.
+        n_episodes: Number of evaluation episodes for each policy.
         seed: Seed of demonstrations, training and evaluation.
 
     Raises:
@@ -81,17 +81,17 @@ def run_demo(
         )
         print(f"{n_written} collision-free trajectories ({dropped.total()} left out)")
 
-    _say(2, f"Training: a small network, {steps} steps; the potential field is fitted on the way")
+    _say(2, f"Training: a small network, {steps} steps; the potential field is fitted during training")
     _train(task, data, output_dir / "train", steps, seed)
 
     episodes: list[EpisodeRow] = []
-    for stage, (name, scale) in enumerate(
+    for stage, (name, guidance_scale) in enumerate(
         (("FMP: guidance off", 0.0), ("PF2MP: the same weights with guidance", DEFAULT_GUIDANCE_SCALE)),
         start=3,
     ):
         _say(stage, f"Evaluation of {name}, {n_episodes} episodes")
-        folder = output_dir / ("eval_pf2mp" if scale else "eval_fmp")
-        episodes += _evaluate(task, checkpoint, folder, n_episodes, seed, scale)
+        folder = output_dir / ("eval_pf2mp" if guidance_scale else "eval_fmp")
+        episodes += _evaluate(task, checkpoint, folder, n_episodes, seed, guidance_scale)
 
     _say(5, "Figure and table")
     figure = output_dir / "overview.png"
@@ -216,7 +216,7 @@ def _evaluate(
 
 
 def _run(command: str, *options: str, equivalent: str | None = None, log: Path | None = None) -> None:
-    """Shows a command of LeRobot or of this package and runs it in a process of its own, its output into `log` if given."""
+    """Prints a command of LeRobot or of this package and runs it in its own process. Its output goes into `log` if given."""
     print(f"$ {command} {shlex.join(options)}")
     if equivalent is not None:
         print(f"  (the same with LeRobot's own loader, slower: {equivalent} with these options)")

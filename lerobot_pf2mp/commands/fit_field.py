@@ -11,7 +11,7 @@ from lerobot_pf2mp.commands.command import given
 
 @dataclass
 class FitFieldPolicyConfig:
-    """Which policy gets a field, and which of its options change; unset ones keep the checkpoint's or default value."""
+    """The policy that gets a field, and changes to its options. Unset ones keep the checkpoint's or the default value."""
 
     # The checkpoint's pretrained_model folder, or a repository user/name on the Hub.
     path: str | None = None
@@ -35,7 +35,7 @@ class FitFieldPolicyConfig:
 
 @dataclass
 class FitFieldDatasetConfig:
-    """Whose actions the field is fitted to."""
+    """The dataset to whose actions the field is fitted."""
 
     # Name of the LeRobotDataset, user/name.
     repo_id: str | None = None
@@ -66,7 +66,7 @@ class FitFieldConfig:
     dataset: FitFieldDatasetConfig = field(default_factory=FitFieldDatasetConfig)
     # Folder of the new checkpoint.
     output_dir: Path | None = None
-    # Whether to replace a checkpoint that is already there.
+    # Whether to replace an existing checkpoint.
     overwrite: bool = False
 
 

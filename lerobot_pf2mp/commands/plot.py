@@ -19,8 +19,8 @@ class PlotConfig:
 
     lambda: collision and success rate against lambda, from --results. density, arrows: the potential field of
     --checkpoint. trajectories: episodes without and with guidance, from the same start and noise. overview: all of these
-    for a maze. strokes: everything written in --n_episodes episodes, without and with guidance. flow: an animation (GIF) of
-    chunks that move from noise to paths. video: one episode without and with guidance, side by side (MP4).
+    for a maze. strokes: all strokes of --n_episodes episodes, without and with guidance. flow: an animation (GIF) of
+    chunks that move from noise to trajectories. video: one episode without and with guidance, side by side (MP4).
 
     Examples:
         pf2mp-plot --figure=lambda --results=[results/maze_lambda] --task=MazeLarge-v0 --output=lambda.png
@@ -37,7 +37,7 @@ class PlotConfig:
     output: Path | None = None
     # For lambda: folders written by pf2mp-benchmark, or their summary.csv.
     results: list[Path] = field(default_factory=list)
-    # For lambda: which task, if the results are of several.
+    # For lambda: the task, if the results are of several tasks.
     task: str | None = None
     # For the others: the pretrained_model folder of a pf2mp or dppf policy, or its repository on the Hub.
     checkpoint: str | None = None
@@ -45,9 +45,9 @@ class PlotConfig:
     env: EnvConfig = field(default_factory=PF2MPMazeEnv)
     # Changes to the policy's options, for example {guidance_scale: 0.4}.
     options: dict[str, Any] = field(default_factory=dict)
-    # Episodes to draw; by default those that show the difference best.
+    # Numbers of the episodes to draw; by default those that show the difference best.
     episodes: list[int] = field(default_factory=list)
-    # How many episodes to draw if none are named; for flow, how many chunks.
+    # Number of episodes to draw if --episodes is empty; for flow, number of chunks.
     n_episodes: int = 6
     # Seed of the first episode; episode i has this seed + i.
     seed: int = 100000

@@ -10,15 +10,15 @@ POLICIES = ("fmp", "pf2mp", "dppf")
 
 @dataclass
 class PolicyServerConfig:
-    """Serves policies to robots elsewhere: LeRobot's asynchronous inference, whose own list of policies is closed.
+    """Serves policies to remote robots by LeRobot's asynchronous inference, whose own server refuses plug-in policies.
 
     Needs: pip install "lerobot_policy_pf2mp[async]". The robot runs LeRobot's own client:
 
         python -m lerobot.async_inference.robot_client --server_address=127.0.0.1:8080 --policy_type=pf2mp \
 --pretrained_name_or_path=you/your_pf2mp --actions_per_chunk=16 --robot.type=so101_follower --robot.port=/dev/ttyACM0
 
-    Client and server exchange pickles, as LeRobot made it: whoever reaches the port can run code on this machine. Let it
-    listen on 127.0.0.1, the default, and use a tunnel to reach it from another one.
+    LeRobot's client and server exchange pickles, so anybody who can connect to the port can run code on this machine. Let it
+    listen on 127.0.0.1, the default, and use a tunnel to connect from another machine.
 
     Examples:
         pf2mp-policy-server
@@ -31,9 +31,9 @@ class PolicyServerConfig:
     port: int = 8080
     # Control frequency of the robot [Hz].
     fps: int = 30
-    # Least time between an observation and its actions [s].
+    # Smallest time between an observation and its actions [s].
     inference_latency: float = 1 / 30
-    # How long to wait for an observation [s].
+    # Longest wait for an observation [s].
     obs_queue_timeout: float = 2.0
 
 
@@ -48,7 +48,7 @@ def main(config: PolicyServerConfig) -> None:
             f'pf2mp-policy-server needs: pip install "lerobot_policy_pf2mp[async]" ({error})'
         ) from error
     server_config = configs.PolicyServerConfig(**asdict(config))
-    # The server checks against this very list.
+    # The server checks the policy type against this list.
     constants.SUPPORTED_POLICIES.extend(
         policy for policy in POLICIES if policy not in constants.SUPPORTED_POLICIES
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command pf2mp-train: the one option of its own, the rest is lerobot-train's."""
+"""The command pf2mp-train. It has one option of its own; the others are those of lerobot-train."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ DEFAULT_MEMORY_LIMIT_GB = 4.0
 USAGE = f"""\
 usage: pf2mp-train [{MEMORY_LIMIT_OPTION}=GB] [options of lerobot-train]
 
-lerobot-train with datasets that hold no images kept in memory, which trains small networks many times faster. Same
-options, configuration, checkpoints, logs, resumption, batches and order.
+lerobot-train, but datasets without images are kept in memory, which trains small networks many times faster. Options,
+configuration, checkpoints, logs, resumption, batches and their order are the same.
 
   {MEMORY_LIMIT_OPTION}=GB  Largest dataset kept in memory [GB]; beyond it, and with images or streaming, the loader is
                           LeRobot's own. (default: {DEFAULT_MEMORY_LIMIT_GB:g})
@@ -45,7 +45,9 @@ def main() -> None:
 
             train(limit_gb)
     except KeyboardInterrupt as interruption:
-        print("\ninterrupted: training goes on from the last checkpoint with --resume=true", file=sys.stderr)
+        print(
+            "\ninterrupted: training continues from the last checkpoint with --resume=true", file=sys.stderr
+        )
         sys.exit(exit_code(interruption))
 
 

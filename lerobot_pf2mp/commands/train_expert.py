@@ -16,8 +16,8 @@ from lerobot_pf2mp.envs.tasks import FETCH_OF_TASK
 class TrainExpertConfig:
     """Trains an expert for Fetch by reinforcement learning, for pf2mp-collect --expert=FOLDER.
 
-    Needs: pip install "lerobot_policy_pf2mp[experts]". Called again, it goes on where it was interrupted, or up to a larger
-    number of steps. The wall blocks the robot; touching it costs nothing unless asked for.
+    Needs: pip install "lerobot_policy_pf2mp[experts]". Called again, it continues where it was interrupted, or up to a
+    larger number of steps. The wall stops the robot. There is no penalty for touching it, unless --collision_penalty is set.
 
     Examples:
         pf2mp-train-expert --task=fetch_reach --output_dir=outputs/expert_reach
@@ -27,11 +27,11 @@ class TrainExpertConfig:
 --output_dir=outputs/careful
     """
 
-    # What to learn: fetch_reach or fetch_push.
+    # Task to learn: fetch_reach or fetch_push.
     task: str = "fetch_reach"
     # ppo, or sac_her (SAC with hindsight experience replay); by default ppo for fetch_reach, sac_her for fetch_push.
     algo: str | None = None
-    # Environment steps of 0.04 s in all, rounded up to whole rollouts (ppo: 2048 steps).
+    # Environment steps of 0.04 s in total, rounded up to whole rollouts (ppo: 2048 steps).
     total_steps: int = 1_000_000
     # Folder of the expert.
     output_dir: Path | None = None
@@ -40,15 +40,15 @@ class TrainExpertConfig:
     reward: str | None = None
     # Subtracted from the reward of each step that touches the wall.
     collision_penalty: float = 0.0
-    # The wall, and where the gripper, the goal and the block are placed.
+    # The wall, and the ranges of positions of the gripper, the goal and the block.
     scene: SceneConfig = field(default_factory=SceneConfig)
-    # Changes to the algorithm's hyper-parameters, under the names of Stable-Baselines3.
+    # Changes to the algorithm's hyperparameters, with the names of Stable-Baselines3.
     options: dict[str, Any] = field(default_factory=dict)
-    # Seed of everything random.
+    # Seed of all random numbers.
     seed: int = 0
     # Environment steps between checkpoints.
     save_freq: int = 50_000
-    # Where the networks are trained, cpu or cuda.
+    # Device on which the networks are trained, cpu or cuda.
     device: str = "cpu"
 
 

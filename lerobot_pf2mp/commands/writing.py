@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options of several commands: what is written, and which regions are restricted."""
+"""Options of several commands: the letter to write, and the restricted regions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lerobot_pf2mp.envs.handwriting.sheet import LETTER_HEIGHT, N_REGIONS, REGIO
 
 @dataclass
 class WritingConfig:
-    """What is written, and which regions are restricted."""
+    """The letter to write, and the restricted regions."""
 
     # Handwriting: the letter, one of C G J L M N O S U V W Z 1 2 3 6 7 8 9.
     letter: str = "S"
@@ -20,9 +20,9 @@ class WritingConfig:
     letter_height: float = LETTER_HEIGHT
     # Handwriting: distance of the restricted regions to the letter [m].
     region_gap: float = REGION_GAP
-    # Handwriting: how many restricted regions are put into the letter's bays.
+    # Handwriting: largest number of restricted regions in the concave parts of the letter.
     n_regions: int = N_REGIONS
-    # Handwriting: a JSON file with a stroke and regions of your own instead, {"stroke": [[x, y], ...], "regions":
+    # Handwriting: a JSON file with your own stroke and regions instead, {"stroke": [[x, y], ...], "regions":
     # [{"centre": [x, y], "radius": r}, {"corners": [[x, y], ...]}]} [m], x forward and y left of the arm's base.
     scene_file: Path | None = None
 

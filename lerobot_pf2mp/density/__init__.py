@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel density estimates: kernels, how wide they are, and their sums."""
+"""Kernel density estimates: Gaussian kernels, their bandwidth and their sums."""

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-/* Sums of Gaussian kernels over many anchors, on a CPU. kernel_tree.py calls this, kernel_sums.py can do without.
+/* Sums of Gaussian kernels over many anchors, on a CPU. Called by kernel_tree.py; kernel_sums.py works without it too.
 
-Anchors lie in the leaves of a k-d tree. Queries are put into groups of neighbours, and each group walks down the tree
-once, nearer child first, past whatever is too far away to count for any of its queries. A query keeps its sums relative
-to the kernel of the nearest anchor seen so far, as attention does, so that they neither overflow nor vanish. Distances
-come from differences, not from |q|^2 - 2 q.x + |x|^2, so that single precision is enough.
+Anchors lie in the leaves of a k-d tree. Queries are sorted into groups of neighbours. Each group walks down the tree
+once, nearer child first, and skips each node that is too far away to count for any of its queries. A query keeps its
+sums relative to the kernel of the nearest anchor seen so far, as attention does, so that they neither overflow nor
+vanish. Distances come from differences, not from |q|^2 - 2 q.x + |x|^2, so that single precision is enough.
 */
 
 #define _GNU_SOURCE /* RTLD_DEFAULT */
@@ -19,12 +19,12 @@ come from differences, not from |q|^2 - 2 q.x + |x|^2, so that single precision 
 #include <string.h>
 
 enum {
-    LANES = 16, /* of one vector */
+    LANES = 16, /* floats in one vector */
     VECTORS = 4,
     WIDTH = VECTORS * LANES, /* anchors of one leaf */
     GROUP = 16,              /* queries that walk together */
     MAX_DEPTH = 64,
-    LEAVES_IN_SINGLE = 64, /* that are added up in single precision before they join the totals */
+    LEAVES_IN_SINGLE = 64, /* leaves added up in single precision before they are added to the totals */
     SAMPLED = 64,          /* points that decide along which dimension a set is split */
     SLICE = 256,           /* queries in one go, if there are enough of them for all threads */
     SLICES_PER_THREAD = 8, /* at most, as some take longer */
@@ -37,7 +37,7 @@ typedef int32_t Integers __attribute__((vector_size(4 * LANES)));
 
 #define INLINE static inline __attribute__((always_inline))
 
-/* One variant for each kind of processor, the fitting one being chosen when the module is loaded. */
+/* Compiles one variant for each kind of processor. The fitting one is chosen when the module is loaded. */
 #if !defined(__x86_64__) || !defined(__GLIBC__)
 #define FOR_EACH_PROCESSOR
 #elif !defined(__clang__) && __GNUC__ >= 12
@@ -46,30 +46,31 @@ typedef int32_t Integers __attribute__((vector_size(4 * LANES)));
 #define FOR_EACH_PROCESSOR __attribute__((target_clones("avx512f", "avx2", "default")))
 #endif
 
-/* Queries further out than this count as this far; slots without an anchor are further out still. */
+/* Coordinates of queries are clamped to FARTHEST. Slots of a leaf without an anchor lie further out. Log sums are at
+   least -LARGEST. */
 static const float FARTHEST = 5e17f, LARGEST = 3e38f;
 
 typedef struct {
     const float *leaves; /* (L, D, WIDTH); leaf i is node L - 1 + i */
     const float *boxes;  /* (2 L - 1, 2, D) corners; node k has the children 2 k + 1 and 2 k + 2 */
-    const float *centre; /* (D,) from which leaves and boxes are seen */
+    const float *centre; /* (D,) origin of leaves and boxes */
     Py_ssize_t n_leaves, dim;
-    float scale; /* log2(e) / 2h^2 */
-    float reach; /* how many powers of two below the nearest anchor's kernel others still count */
+    float exponent_per_square; /* log2(e) / 2h^2: times a squared distance, it is a kernel's negative exponent of 2 */
+    float exponent_range;      /* kernels smaller than the nearest anchor's by more powers of two are left out */
 } Tree;
 
 typedef struct {
     Py_ssize_t size;
-    float *places;     /* (G, D) seen from the centre */
+    float *positions;  /* (G, D) relative to the centre */
     float *low, *high; /* (D,) corners of the box around them */
     float *nearest;    /* (G,) squared distances to the nearest anchor seen so far */
-    float *way;        /* (G, D) offsets to it, where these are asked for */
+    float *offsets;    /* (G, D) to that anchor; only for the aim NEAREST */
     Lanes *sums;       /* (G, 1 + D) of kernels, and of kernels times offsets, each relative to the nearest anchor's */
     double *totals;    /* (G, 1 + D) of what left `sums` */
     int *n_leaves;     /* (G,) that `sums` holds */
 } Group;
 
-/* What is asked for: the sums, or the nearest anchor alone. */
+/* The wanted result: the sums, or only the nearest anchor. */
 typedef enum { SUMS, NEAREST } Aim;
 
 /* ---- Sorting points into groups of neighbours -------------------------------------------------------------------- */
@@ -92,7 +93,7 @@ static Py_ssize_t widest_dimension(const float *points, Py_ssize_t dim, const in
     return widest;
 }
 
-/* Reorders so that no key before place k is larger than one behind it (Hoare's selection). */
+/* Reorders so that no key before index k is larger than one after it (Hoare's selection). */
 static void partition_at(const float *keys, Py_ssize_t dim, int64_t *order, Py_ssize_t n, Py_ssize_t k) {
     Py_ssize_t first = 0, last = n - 1;
     while (first < last) {
@@ -116,7 +117,7 @@ static void partition_at(const float *keys, Py_ssize_t dim, int64_t *order, Py_s
     }
 }
 
-/* Of n leaves of a binary tree that is full but for its last level, how many lie left of the root. */
+/* The number of leaves left of the root, in a binary tree of n leaves that is full except for its last level. */
 static Py_ssize_t left_of(Py_ssize_t n_leaves) {
     Py_ssize_t full = 1;
     while (2 * full <= n_leaves) full *= 2;
@@ -124,7 +125,7 @@ static Py_ssize_t left_of(Py_ssize_t n_leaves) {
     return half < full ? half : full;
 }
 
-/* Orders points so that every set of `size` successive ones, but for a smaller last one, is a leaf of such a tree. */
+/* Orders points so that each run of `size` successive points is a leaf of such a tree. The last leaf may be smaller. */
 static void sort(const float *points, Py_ssize_t dim, int64_t *order, Py_ssize_t n, Py_ssize_t size) {
     while (n > size) {
         const Py_ssize_t half = left_of((n + size - 1) / size) * size;
@@ -136,7 +137,7 @@ static void sort(const float *points, Py_ssize_t dim, int64_t *order, Py_ssize_t
 
 /* ---- Kernels of one query and the anchors of one leaf ------------------------------------------------------------ */
 
-INLINE Lanes load(const float *place) { return *(const LooseLanes *)place; }
+INLINE Lanes load(const float *address) { return *(const LooseLanes *)address; }
 
 INLINE Lanes lower(Lanes a, Lanes b) {
     const Integers is_lower = a < b;
@@ -197,11 +198,11 @@ INLINE void distances(const float *leaf, const float *q, const Py_ssize_t dim, L
 INLINE void add_kernels(
     const Tree *tree, const float *leaf, Group *group, Py_ssize_t i, const Lanes squares[VECTORS], const Py_ssize_t dim
 ) {
-    const float *q = group->places + i * dim;
+    const float *q = group->positions + i * dim;
     Lanes *sums = group->sums + i * (1 + dim);
     Lanes weights[VECTORS];
     for (int v = 0; v < VECTORS; v++) {
-        weights[v] = power_of_two(tree->scale * (group->nearest[i] - squares[v]));
+        weights[v] = power_of_two(tree->exponent_per_square * (group->nearest[i] - squares[v]));
         sums[0] += weights[v];
     }
     for (Py_ssize_t d = 0; d < dim; d++) {
@@ -219,31 +220,34 @@ INLINE void shrink(Group *group, Py_ssize_t i, float factor, const Py_ssize_t di
     }
 }
 
-/* Notes the way to the anchor of a leaf that is this far away. */
-INLINE void go_to(const float *leaf, Group *group, Py_ssize_t i, const Lanes squares[VECTORS], const Py_ssize_t dim) {
+/* Stores the offset to the anchor of this leaf that is nearest to query i. */
+INLINE void store_offset(
+    const float *leaf, Group *group, Py_ssize_t i, const Lanes squares[VECTORS], const Py_ssize_t dim
+) {
     float flat[WIDTH];
     memcpy(flat, squares, sizeof flat);
     int slot = 0;
     while (slot < WIDTH - 1 && flat[slot] != group->nearest[i]) slot++;
-    for (Py_ssize_t d = 0; d < dim; d++) group->way[i * dim + d] = leaf[d * WIDTH + slot] - group->places[i * dim + d];
+    for (Py_ssize_t d = 0; d < dim; d++)
+        group->offsets[i * dim + d] = leaf[d * WIDTH + slot] - group->positions[i * dim + d];
 }
 
 INLINE void visit_leaf(
     const Tree *tree, const float *leaf, Group *group, Py_ssize_t i, const Py_ssize_t dim, const Aim aim
 ) {
     Lanes squares[VECTORS];
-    distances(leaf, group->places + i * dim, dim, squares);
+    distances(leaf, group->positions + i * dim, dim, squares);
     Lanes least = squares[0];
     for (int v = 1; v < VECTORS; v++) least = lower(least, squares[v]);
     const float nearest = lowest(least), before = group->nearest[i];
     if (nearest < before) {
         group->nearest[i] = nearest;
         if (aim == NEAREST)
-            go_to(leaf, group, i, squares, dim);
+            store_offset(leaf, group, i, squares, dim);
         else
-            shrink(group, i, exp2f(tree->scale * (nearest - before)), dim);
+            shrink(group, i, exp2f(tree->exponent_per_square * (nearest - before)), dim);
     }
-    const int counts = !(tree->scale * (nearest - before) > tree->reach);
+    const int counts = !(tree->exponent_per_square * (nearest - before) > tree->exponent_range);
     if (aim == SUMS && counts) add_kernels(tree, leaf, group, i, squares, dim);
 }
 
@@ -261,7 +265,7 @@ INLINE float gap(const float *low, const float *high, const float *box, const Py
 }
 
 INLINE void walk(const Tree *tree, Group *group, const Py_ssize_t dim, const Aim aim) {
-    const float reach = aim == SUMS ? tree->reach : 0.0f;
+    const float exponent_range = aim == SUMS ? tree->exponent_range : 0.0f;
     struct {
         Py_ssize_t node;
         float square;
@@ -269,7 +273,7 @@ INLINE void walk(const Tree *tree, Group *group, const Py_ssize_t dim, const Aim
     float farthest = INFINITY; /* of the queries' nearest anchors */
     for (int n_todo = 1; n_todo;) {
         const Py_ssize_t node = todo[--n_todo].node;
-        if (tree->scale * (todo[n_todo].square - farthest) > reach) continue;
+        if (tree->exponent_per_square * (todo[n_todo].square - farthest) > exponent_range) continue;
         if (node < tree->n_leaves - 1) {
             Py_ssize_t near = 2 * node + 1, far = near + 1;
             float near_square = gap(group->low, group->high, tree->boxes + near * 2 * dim, dim);
@@ -287,8 +291,8 @@ INLINE void walk(const Tree *tree, Group *group, const Py_ssize_t dim, const Aim
         const float *box = tree->boxes + node * 2 * dim;
         farthest = 0.0f;
         for (Py_ssize_t i = 0; i < group->size; i++) {
-            const float *q = group->places + i * dim;
-            if (!(tree->scale * (gap(q, q, box, dim) - group->nearest[i]) > reach))
+            const float *q = group->positions + i * dim;
+            if (!(tree->exponent_per_square * (gap(q, q, box, dim) - group->nearest[i]) > exponent_range))
                 visit_leaf(tree, leaf, group, i, dim, aim);
             farthest = group->nearest[i] > farthest ? group->nearest[i] : farthest;
         }
@@ -305,7 +309,7 @@ FOR_EACH_PROCESSOR static void sum_up(const Tree *tree, Group *group) {
     }
 }
 
-FOR_EACH_PROCESSOR static void look_around(const Tree *tree, Group *group) { walk(tree, group, tree->dim, NEAREST); }
+FOR_EACH_PROCESSOR static void find_nearest(const Tree *tree, Group *group) { walk(tree, group, tree->dim, NEAREST); }
 
 /* ---- Groups of queries ------------------------------------------------------------------------------------------- */
 
@@ -316,15 +320,15 @@ static void gather(Group *group, const Tree *tree, const float *queries, const i
     for (Py_ssize_t i = 0; i < size; i++) {
         for (Py_ssize_t d = 0; d < dim; d++) {
             const float x = queries[order[i] * dim + d] - tree->centre[d];
-            const float place = x < -FARTHEST ? -FARTHEST : x > FARTHEST ? FARTHEST : x;
-            group->places[i * dim + d] = place;
-            group->low[d] = place < group->low[d] ? place : group->low[d];
-            group->high[d] = place > group->high[d] ? place : group->high[d];
+            const float clamped = x < -FARTHEST ? -FARTHEST : x > FARTHEST ? FARTHEST : x;
+            group->positions[i * dim + d] = clamped;
+            group->low[d] = clamped < group->low[d] ? clamped : group->low[d];
+            group->high[d] = clamped > group->high[d] ? clamped : group->high[d];
         }
         group->nearest[i] = INFINITY;
         group->n_leaves[i] = 0;
     }
-    memset(group->way, 0, size * dim * sizeof *group->way);
+    memset(group->offsets, 0, size * dim * sizeof *group->offsets);
     memset(group->sums, 0, size * (1 + dim) * sizeof *group->sums);
     memset(group->totals, 0, size * (1 + dim) * sizeof *group->totals);
 }
@@ -334,27 +338,27 @@ static void scatter_sums(Group *group, const Tree *tree, const int64_t *order, f
     for (Py_ssize_t i = 0; i < group->size; i++) {
         move_to_totals(group, i, dim);
         const double *totals = group->totals + i * (1 + dim);
-        const double log_sum = log(totals[0]) - M_LN2 * tree->scale * (double)group->nearest[i];
+        const double log_sum = log(totals[0]) - M_LN2 * tree->exponent_per_square * (double)group->nearest[i];
         log_sums[order[i]] = log_sum < -LARGEST ? -LARGEST : (float)log_sum;
         if (!offsets) continue;
         for (Py_ssize_t d = 0; d < dim; d++) offsets[order[i] * dim + d] = (float)(totals[1 + d] / totals[0]);
     }
 }
 
-static void scatter_way(const Group *group, Py_ssize_t dim, const int64_t *order, float *offsets) {
+static void scatter_offsets(const Group *group, Py_ssize_t dim, const int64_t *order, float *offsets) {
     for (Py_ssize_t i = 0; i < group->size; i++)
-        memcpy(offsets + order[i] * dim, group->way + i * dim, dim * sizeof *offsets);
+        memcpy(offsets + order[i] * dim, group->offsets + i * dim, dim * sizeof *offsets);
 }
 
-/* What to do for n of the queries, in an order that changes: log sums, and offsets to local means unless NULL; without
-   log sums, offsets to the nearest anchor. */
+/* A computation for n of the queries. `order` holds their indices and is reordered. The result is log sums, and unless
+   `offsets` is NULL the offsets to the local means. If `log_sums` is NULL, it is the offsets to the nearest anchor. */
 typedef struct {
     const Tree *tree;
     const float *queries;
     int64_t *order;
     Py_ssize_t n;
     float *offsets, *log_sums;
-    Py_ssize_t n_slices, next_slice; /* that threads take one after the other */
+    Py_ssize_t n_slices, next_slice; /* each thread takes the next slice when it has finished one */
     int has_memory;
 } Job;
 
@@ -367,9 +371,9 @@ static int do_slice(const Job *job, int64_t *order, Py_ssize_t n) {
     int n_in_sums[GROUP];
     const int has_memory = sums && totals && floats;
     if (has_memory) {
-        Group group = {.sums = sums, .totals = totals, .n_leaves = n_in_sums, .places = floats};
-        group.way = group.places + GROUP * dim;
-        group.low = group.way + GROUP * dim;
+        Group group = {.sums = sums, .totals = totals, .n_leaves = n_in_sums, .positions = floats};
+        group.offsets = group.positions + GROUP * dim;
+        group.low = group.offsets + GROUP * dim;
         group.high = group.low + dim;
         group.nearest = group.high + dim;
         sort(job->queries, dim, order, n, GROUP);
@@ -379,8 +383,8 @@ static int do_slice(const Job *job, int64_t *order, Py_ssize_t n) {
                 sum_up(tree, &group);
                 scatter_sums(&group, tree, order + i, job->offsets, job->log_sums);
             } else {
-                look_around(tree, &group);
-                scatter_way(&group, dim, order + i, job->offsets);
+                find_nearest(tree, &group);
+                scatter_offsets(&group, dim, order + i, job->offsets);
             }
         }
     }
@@ -399,7 +403,7 @@ static void do_slices(void *pointer) {
 
 static Py_ssize_t smaller(Py_ssize_t a, Py_ssize_t b) { return a < b ? a : b; }
 
-/* As many slices as are worth it, of one group at least. */
+/* The number of slices that are worth the overhead; each has at least one group. */
 static Py_ssize_t n_slices_of(const Job *job, int n_threads) {
     const double work = (double)job->n * job->tree->n_leaves * WIDTH * job->tree->dim / WORK;
     Py_ssize_t n_slices = 1 + job->n / SLICE;
@@ -409,8 +413,8 @@ static Py_ssize_t n_slices_of(const Job *job, int n_threads) {
     return n_slices > 1 ? n_slices : 1;
 }
 
-/* False without memory. The threads are those of PyTorch's OpenMP: others would have to share the cores with them, as they
-   keep spinning for a while after their work. */
+/* Returns false if memory runs out. The threads are those of PyTorch's OpenMP. Other threads would compete with them
+   for the cores, because OpenMP threads keep spinning for a while after their work. */
 static int do_job(Job *job, int n_threads) {
     typedef void Parallel(void (*)(void *), void *, unsigned, unsigned);
     Parallel *parallel = NULL;
@@ -440,7 +444,7 @@ static int sum_all(
     return has_memory;
 }
 
-/* Keeps those of n indices whose value is not above the threshold, and says how many these are. */
+/* Keeps those of n indices whose value is not above the threshold; returns their number. */
 static Py_ssize_t keep_low(int64_t *order, Py_ssize_t n, const float *values, float threshold) {
     Py_ssize_t n_kept = 0;
     for (Py_ssize_t i = 0; i < n; i++)
@@ -448,7 +452,8 @@ static Py_ssize_t keep_low(int64_t *order, Py_ssize_t n, const float *values, fl
     return n_kept;
 }
 
-/* The way to the nearest target for queries whose log sum is not above the threshold; known lower bounds, or NULL. */
+/* Offsets to the nearest target for queries whose log sum is not above the threshold; zero for the others. `at_least`
+   holds known lower bounds of the log sums, or is NULL. Returns false if memory runs out. */
 static int lead_all_to_targets(
     const Tree *tree, const Tree *targets, const float *queries, Py_ssize_t n, const float *at_least, float threshold,
     float *offsets, int n_threads
@@ -470,50 +475,52 @@ static int lead_all_to_targets(
     return has_memory;
 }
 
-/* A share of the way to the local mean, and from there the way to the nearest target as far as `reach`, where the log sum
-   is not above the threshold. */
+/* Steps that cover a `share` of the offset to the local mean. Where the log sum there is not above the threshold, they
+   go on towards the nearest target, by at most `max_distance`. Returns false if memory runs out. */
 static int step_all_to_targets(
-    const Tree *tree, const Tree *targets, const float *queries, Py_ssize_t n, float threshold, float share, float reach,
-    float *steps, int n_threads
+    const Tree *tree, const Tree *targets, const float *queries, Py_ssize_t n, float threshold, float share,
+    float max_distance, float *steps, int n_threads
 ) {
     const Py_ssize_t dim = tree->dim;
     float *log_sums = malloc((n + 1) * sizeof *log_sums);
-    float *places = malloc((n * dim + 1) * sizeof *places), *ways = malloc((n * dim + 1) * sizeof *ways);
-    int has_memory = log_sums && places && ways && sum_all(tree, queries, n, steps, log_sums, n_threads);
+    float *shifted = malloc((n * dim + 1) * sizeof *shifted), *offsets = malloc((n * dim + 1) * sizeof *offsets);
+    int has_memory = log_sums && shifted && offsets && sum_all(tree, queries, n, steps, log_sums, n_threads);
     if (has_memory) {
-        const double gain = share * (2.0 - share) * M_LN2 * tree->scale;
+        const double gain = share * (2.0 - share) * M_LN2 * tree->exponent_per_square;
         for (Py_ssize_t i = 0; i < n; i++) {
             double square = 0.0;
             for (Py_ssize_t d = i * dim; d < (i + 1) * dim; d++) {
                 square += (double)steps[d] * steps[d];
                 steps[d] *= share;
-                places[d] = queries[d] + steps[d];
+                shifted[d] = queries[d] + steps[d];
             }
             /* A mean shift raises the log density by at least this (Comaniciu and Meer 2002, Theorem 1). */
             log_sums[i] = (float)(log_sums[i] + gain * square);
         }
-        has_memory = lead_all_to_targets(tree, targets, places, n, log_sums, threshold, ways, n_threads);
+        has_memory = lead_all_to_targets(tree, targets, shifted, n, log_sums, threshold, offsets, n_threads);
     }
     for (Py_ssize_t i = 0; has_memory && i < n; i++) {
         double square = 0.0;
-        for (Py_ssize_t d = i * dim; d < (i + 1) * dim; d++) square += (double)ways[d] * ways[d];
-        const float factor = square > (double)reach * reach ? (float)(reach / sqrt(square)) : 1.0f;
-        for (Py_ssize_t d = i * dim; d < (i + 1) * dim; d++) steps[d] += factor * ways[d];
+        for (Py_ssize_t d = i * dim; d < (i + 1) * dim; d++) square += (double)offsets[d] * offsets[d];
+        const int is_far = square > (double)max_distance * max_distance;
+        const float factor = is_far ? (float)(max_distance / sqrt(square)) : 1.0f;
+        for (Py_ssize_t d = i * dim; d < (i + 1) * dim; d++) steps[d] += factor * offsets[d];
     }
-    free(log_sums), free(places), free(ways);
+    free(log_sums), free(shifted), free(offsets);
     return has_memory;
 }
 
 /* ---- For Python -------------------------------------------------------------------------------------------------- */
 
-/* A tree as Python holds it: (leaves, boxes, centre, scale, reach). */
+/* A tree as Python holds it: (leaves, boxes, centre, exponent_per_square, exponent_range). */
 typedef struct {
     Py_buffer leaves, boxes, centre;
-    float scale, reach;
+    float exponent_per_square, exponent_range;
 } HeldTree;
 
 #define HELD_TREE "(y*y*y*ff)"
-#define POINTERS_TO(held) &(held).leaves, &(held).boxes, &(held).centre, &(held).scale, &(held).reach
+#define POINTERS_TO(held) \
+    &(held).leaves, &(held).boxes, &(held).centre, &(held).exponent_per_square, &(held).exponent_range
 
 static void release(HeldTree *held) {
     PyBuffer_Release(&held->leaves), PyBuffer_Release(&held->boxes), PyBuffer_Release(&held->centre);
@@ -526,7 +533,8 @@ static int read_tree(const HeldTree *held, Tree *tree) {
     const Py_ssize_t dim = n_floats(&held->centre), n_nodes = dim ? n_floats(&held->boxes) / (2 * dim) : 0;
     *tree = (Tree){
         .leaves = held->leaves.buf, .boxes = held->boxes.buf, .centre = held->centre.buf,
-        .n_leaves = (n_nodes + 1) / 2, .dim = dim, .scale = held->scale, .reach = held->reach,
+        .n_leaves = (n_nodes + 1) / 2, .dim = dim,
+        .exponent_per_square = held->exponent_per_square, .exponent_range = held->exponent_range,
     };
     return n_nodes % 2 && n_floats(&held->boxes) == n_nodes * 2 * dim
         && n_floats(&held->leaves) == tree->n_leaves * dim * WIDTH;
@@ -578,74 +586,76 @@ static PyObject *sum_kernels(PyObject *module, PyObject *args) {
     return answer(fits, has_memory);
 }
 
-/* What the two functions below share: trees, queries, and where the result goes. */
+/* The arguments that the two functions below share. */
 typedef struct {
     HeldTree held, held_targets;
     Tree tree, targets;
     Py_buffer queries, result;
     Py_ssize_t n;
-} Way;
+} Request;
 
-static int read_way(Way *way) {
-    const int fits = read_tree(&way->held, &way->tree) && read_tree(&way->held_targets, &way->targets)
-        && way->tree.dim == way->targets.dim && n_floats(&way->queries) % way->tree.dim == 0
-        && way->result.len == way->queries.len;
-    way->n = fits ? n_floats(&way->queries) / way->tree.dim : 0;
+static int read_request(Request *request) {
+    const int fits = read_tree(&request->held, &request->tree) && read_tree(&request->held_targets, &request->targets)
+        && request->tree.dim == request->targets.dim && n_floats(&request->queries) % request->tree.dim == 0
+        && request->result.len == request->queries.len;
+    request->n = fits ? n_floats(&request->queries) / request->tree.dim : 0;
     return fits;
 }
 
-static void release_way(Way *way) {
-    release(&way->held), release(&way->held_targets);
-    PyBuffer_Release(&way->queries), PyBuffer_Release(&way->result);
+static void release_request(Request *request) {
+    release(&request->held), release(&request->held_targets);
+    PyBuffer_Release(&request->queries), PyBuffer_Release(&request->result);
 }
 
 static PyObject *lead_to_targets(PyObject *module, PyObject *args) {
-    Way way;
+    Request request;
     float threshold;
     int n_threads, has_memory = 1;
     if (!PyArg_ParseTuple(
-            args, HELD_TREE HELD_TREE "y*fw*i", POINTERS_TO(way.held), POINTERS_TO(way.held_targets), &way.queries,
-            &threshold, &way.result, &n_threads
+            args, HELD_TREE HELD_TREE "y*fw*i", POINTERS_TO(request.held), POINTERS_TO(request.held_targets),
+            &request.queries, &threshold, &request.result, &n_threads
         ))
         return NULL;
-    const int fits = read_way(&way);
+    const int fits = read_request(&request);
     if (fits) {
         Py_BEGIN_ALLOW_THREADS;
         has_memory = lead_all_to_targets(
-            &way.tree, &way.targets, way.queries.buf, way.n, NULL, threshold, way.result.buf, n_threads
+            &request.tree, &request.targets, request.queries.buf, request.n, NULL, threshold,
+            request.result.buf, n_threads
         );
         Py_END_ALLOW_THREADS;
     }
-    release_way(&way);
+    release_request(&request);
     return answer(fits, has_memory);
 }
 
 static PyObject *step_to_targets(PyObject *module, PyObject *args) {
-    Way way;
-    float threshold, share, reach;
+    Request request;
+    float threshold, share, max_distance;
     int n_threads, has_memory = 1;
     if (!PyArg_ParseTuple(
-            args, HELD_TREE HELD_TREE "y*fffw*i", POINTERS_TO(way.held), POINTERS_TO(way.held_targets), &way.queries,
-            &threshold, &share, &reach, &way.result, &n_threads
+            args, HELD_TREE HELD_TREE "y*fffw*i", POINTERS_TO(request.held), POINTERS_TO(request.held_targets),
+            &request.queries, &threshold, &share, &max_distance, &request.result, &n_threads
         ))
         return NULL;
-    const int fits = read_way(&way);
+    const int fits = read_request(&request);
     if (fits) {
         Py_BEGIN_ALLOW_THREADS;
         has_memory = step_all_to_targets(
-            &way.tree, &way.targets, way.queries.buf, way.n, threshold, share, reach, way.result.buf, n_threads
+            &request.tree, &request.targets, request.queries.buf, request.n, threshold, share, max_distance,
+            request.result.buf, n_threads
         );
         Py_END_ALLOW_THREADS;
     }
-    release_way(&way);
+    release_request(&request);
     return answer(fits, has_memory);
 }
 
 static PyMethodDef methods[] = {
     {"order_points", order_points, METH_VARARGS, "Sorts points into leaves."},
     {"sum_kernels", sum_kernels, METH_VARARGS, "The offsets to local means, and the logarithms of the sums."},
-    {"lead_to_targets", lead_to_targets, METH_VARARGS, "The offsets from where few anchors are to the nearest target."},
-    {"step_to_targets", step_to_targets, METH_VARARGS, "The steps to local means and on to the nearest target."},
+    {"lead_to_targets", lead_to_targets, METH_VARARGS, "The offsets to the nearest target where the log sum is low."},
+    {"step_to_targets", step_to_targets, METH_VARARGS, "The steps to local means and, at a low log sum, to targets."},
     {NULL, NULL, 0, NULL},
 };
 

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The C extension. All arrays are float32 and contiguous unless said otherwise; it holds no lock while it works.
+"""The C extension. All arrays are float32 and contiguous unless stated otherwise. It releases the GIL while it works.
 
-A tree is what `KernelTree` holds: (leaves, boxes, centre, scale, reach). Sizes that do not fit raise a ValueError.
+A tree is what `KernelTree` holds: (leaves, boxes, centre, exponent_per_square, exponent_range). A ValueError is raised
+if the sizes of the arrays do not fit.
 """
 
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ type Tree = tuple[NDArray, NDArray, NDArray, float, float]
 LEAF_SIZE: int
 
 def order_points(points: NDArray, order: NDArray) -> None:
-    """Fills `order` ``(N,)`` int64 so that every LEAF_SIZE successive points ``(N, D)`` are a leaf's."""
+    """Fills `order` ``(N,)`` int64 so that each LEAF_SIZE successive points ``(N, D)`` are one leaf."""
 
 def sum_kernels(tree: Tree, queries: NDArray, offsets: NDArray, log_sums: NDArray, n_threads: int) -> None:
     """Fills `offsets` ``(Q, D)`` to the local means and `log_sums` ``(Q,)`` of the kernels at queries ``(Q, D)``."""
@@ -19,7 +20,7 @@ def sum_kernels(tree: Tree, queries: NDArray, offsets: NDArray, log_sums: NDArra
 def lead_to_targets(
     tree: Tree, targets: Tree, queries: NDArray, threshold: float, offsets: NDArray, n_threads: int
 ) -> None:
-    """Fills `offsets` ``(Q, D)``: to the nearest target where the log sum is not above the threshold, elsewhere 0."""
+    """Fills `offsets` ``(Q, D)`` to the nearest target; zero where the log sum is above the threshold."""
 
 def step_to_targets(
     tree: Tree,
@@ -27,11 +28,11 @@ def step_to_targets(
     queries: NDArray,
     threshold: float,
     share: float,
-    reach: float,
+    max_distance: float,
     steps: NDArray,
     n_threads: int,
 ) -> None:
-    """Fills `steps` ``(Q, D)``: a share of the way to the local mean, and from there at most `reach` to the nearest target.
+    """Fills `steps` ``(Q, D)``, which cover a share of the offset to the local mean.
 
-    The second part is where the log sum there is not above the threshold.
+    Where the log sum there is not above the threshold, they go on towards the nearest target, at most `max_distance`.
     """

@@ -12,7 +12,7 @@ from lerobot_pf2mp.density.kernels import PAIRS_PER_BLOCK, log_kernels, log_sum_
 
 BANDWIDTH_RULES = ("scott", "silverman", "likelihood")
 
-# Relative to the spread of the points. Below it a float32 kernel resolves nothing but duplicates.
+# Smallest bandwidth, relative to the spread of the points. Float32 cannot resolve narrower kernels.
 _SMALLEST_BANDWIDTH = 1e-3
 
 
@@ -67,7 +67,7 @@ def select_bandwidth(points: Tensor, rule: float | str = "likelihood") -> float:
     variance = points.cpu().double().var(dim=0, correction=0)  # (D,)
     varying = variance > 0
     if not bool(varying.any()):
-        return _SMALLEST_BANDWIDTH  # all points are the same one: there is no spread to measure
+        return _SMALLEST_BANDWIDTH  # all points are equal, so there is no spread to measure
     spread = variance[varying].mean().sqrt().item()
     count, dim = len(points), int(varying.sum())
     scott = spread * count ** (-1 / (dim + 4))
@@ -81,7 +81,7 @@ def select_bandwidth(points: Tensor, rule: float | str = "likelihood") -> float:
 
 
 def leave_one_out_log_likelihood(points: Tensor, bandwidth: float) -> float:
-    """The mean of log p_{-i}(x_i) over the points, p_{-i} being the density fitted without point i.
+    """The mean of log p_{-i}(x_i) over the points, where p_{-i} is the density fitted without point i.
 
     Args:
         points: ``(M, D)`` distinct points, M >= 2.
@@ -104,10 +104,11 @@ def leave_one_out_log_likelihood(points: Tensor, bandwidth: float) -> float:
 
 @torch.no_grad()
 def _most_likely_bandwidth(points: Tensor, smallest: float, largest: float, n_points: int = 3000) -> float:
-    """The bandwidth of largest leave-one-out likelihood, to 1 %, by golden-section search on log h.
+    """The bandwidth with the largest leave-one-out likelihood, to 1 %, by golden-section search on log h.
 
     Duplicated points are dropped first: with them the likelihood is unbounded as h tends to 0. For more than
-    `n_points` points an even subset is used, and the h found is carried over by Scott's power of the count.
+    `n_points` points an evenly spaced subset is used. The h found is then corrected for the number of points by
+    Scott's rule, h ~ M^(-1/(D+4)).
     """
     distinct = torch.unique(points.float(), dim=0)
     if len(distinct) < 2:

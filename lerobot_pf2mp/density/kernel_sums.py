@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sums of Gaussian kernels over anchors: their logarithm, and the kernel-weighted mean of the anchors.
 
-Three ways to the same numbers: on a CPU a walk down a tree of the anchors (kernel_tree.py); where that could not be built,
-and in a compiled graph if there is no tree yet, one attention call; on other devices softmax and sum, block by block.
+There are three implementations with equal results:
+- on a CPU a search in a tree of the anchors (kernel_tree.py);
+- on a CPU one attention call, where the C extension could not be built, or in a compiled graph if there is no tree yet;
+- on other devices softmax and sum, block by block.
 """
 
 from __future__ import annotations
@@ -18,10 +20,10 @@ from lerobot_pf2mp.density import kernel_tree
 from lerobot_pf2mp.density.kernel_tree import KernelTree
 from lerobot_pf2mp.density.kernels import PAIRS_PER_BLOCK, log_kernels, log_sum_exp, mean
 
-# Queries and anchors further from the origin than this (many bandwidths) count as this far, or squares would overflow.
+# Queries and anchors are clamped to this many bandwidths, because larger squares would overflow.
 _FARTHEST = 5e17
 
-# Exponents |q|^2 / 2h^2 up to which float32 resolves their differences to some 1e-5.
+# Largest exponent |q|^2 / 2h^2 for which float32 resolves differences of exponents to about 1e-5.
 _LARGEST_SINGLE_EXPONENT = 64.0
 
 
@@ -30,7 +32,7 @@ class KernelSums:
     """Sums of Gaussian kernels over given anchors.
 
     Args:
-        anchors: ``(M, D)`` float32 places of the kernels, M >= 1.
+        anchors: ``(M, D)`` float32 positions of the kernels, M >= 1.
         bandwidth: Standard deviation h > 0 of the kernels.
     """
 
@@ -38,32 +40,33 @@ class KernelSums:
     bandwidth: float
 
     def __call__(self, queries: Tensor) -> tuple[Tensor, Tensor]:
-        """The local means and the log sums at queries; finite everywhere, in O(M + Q) memory.
+        """The offsets to the local means, and the log sums, at queries. They are finite everywhere. Memory is O(M + Q).
 
         Args:
             queries: ``(Q, D)`` float32 on the anchors' device.
 
         Returns:
-            ``(Q, D)`` the offsets m(q) - q to m(q) = sum_i w_i x_i with w = softmax_i(-|q - x_i|^2 / 2h^2), and ``(Q,)``
-            log sum_i exp(-|q - x_i|^2 / 2h^2).
+            ``(Q, D)`` the offsets m(q) - q to the local means m(q) = sum_i w_i x_i with w = softmax_i(-|q - x_i|^2 / 2h^2);
+            ``(Q,)`` the log sums log sum_i exp(-|q - x_i|^2 / 2h^2).
         """
         if not len(queries):
-            return queries, queries.new_empty(0)  # on which attention would crash
+            return queries, queries.new_empty(0)  # attention would crash on no queries
         if self.has_tree:
             return self.tree.sums(queries)
-        with torch.autocast(device_type=queries.device.type, enabled=False):  # it would multiply in bfloat16
+        # Autocast would multiply in bfloat16.
+        with torch.autocast(device_type=queries.device.type, enabled=False):
             centred = queries - self._centre
             return (self._by_attention if queries.device.type == "cpu" else self._from_differences)(centred)
 
     @property
     def has_tree(self) -> bool:
-        """Whether the sums come from a walk down `tree`."""
+        """Whether the sums come from `tree`."""
         is_possible = self.anchors.device.type == "cpu" and kernel_tree.is_available()
         return is_possible and ("tree" in vars(self) or not torch.compiler.is_compiling())
 
     @cached_property
     def tree(self) -> KernelTree:
-        """The tree of the anchors; only where `has_tree`."""
+        """The tree of the anchors; only valid if `has_tree`."""
         return KernelTree.of(self.anchors, self.bandwidth)
 
     def _from_differences(self, queries: Tensor) -> tuple[Tensor, Tensor]:
@@ -78,12 +81,12 @@ class KernelSums:
         return offsets, log_sums
 
     def _by_attention(self, queries: Tensor) -> tuple[Tensor, Tensor]:
-        # A look at the values, on which a compiled graph would break, tells whether single precision is enough.
+        # Whether single precision is enough depends on the values. Reading them would break a compiled graph.
         if torch.compiler.is_compiling() or not self._keys.are_resolved_in_single(queries):
             return self._double_keys.attend(queries)
         return self._keys.attend(queries)
 
-    # Distances are taken after centring: float32 resolves differences between points, not their common offset.
+    # Anchors and queries are centred first: float32 resolves differences between points, but not a large common offset.
 
     @cached_property
     def _centre(self) -> Tensor:
@@ -104,14 +107,14 @@ class KernelSums:
 
 @dataclass(frozen=True, eq=False)
 class _Keys:
-    """Anchors as an attention call needs them, in float32 or float64.
+    """Anchors in the form that an attention call needs, in float32 or float64.
 
-    With queries q / h, keys x / h, biases -|x|^2 / 2h^2 and values x, its output is the mean, and the normaliser of its
-    softmax is the sum, up to exp(-|q|^2 / 2h^2).
+    The call gets queries q / h, keys x / h, biases -|x|^2 / 2h^2 and values x. Its output is the local mean. The
+    normaliser of its softmax is the sum of the kernels, except for the factor exp(-|q|^2 / 2h^2).
 
     Args:
         keys: ``(1, 1, M, D + 1)``, x / h and the bias.
-        values: ``(1, 1, M, D + 1)``, x and a zero, as values must have the keys' size.
+        values: ``(1, 1, M, D + 1)``, x and a zero, because values must have the size of keys.
         bandwidth: h.
     """
 
@@ -128,7 +131,7 @@ class _Keys:
         )
 
     def are_resolved_in_single(self, queries: Tensor) -> bool:
-        """Whether rounding the exponents to float32 changes the weights by some 1e-5, relatively."""
+        """Whether rounding the exponents to float32 changes the weights by only about 1e-5, relatively."""
         if self._largest_exponent > _LARGEST_SINGLE_EXPONENT:
             return False
         return bool((queries / self.bandwidth).square().sum(dim=1).max() <= 2 * _LARGEST_SINGLE_EXPONENT)
@@ -138,7 +141,7 @@ class _Keys:
         return -self.keys[..., -1].min().item()
 
     def attend(self, queries: Tensor) -> tuple[Tensor, Tensor]:
-        """What `KernelSums` returns, for float32 queries ``(Q, D)``."""
+        """The offsets and log sums of `KernelSums`, for float32 queries ``(Q, D)``."""
         precise = queries.to(self.keys.dtype)
         scaled = (precise / self.bandwidth).clamp(-_FARTHEST, _FARTHEST)
         means, log_normalisers = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu(

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sums of Gaussian kernels over a k-d tree of anchors, on a CPU: what `KernelSums` returns, by a small C extension.
+"""Sums of Gaussian kernels over a k-d tree of anchors, on a CPU: the results of `KernelSums`, from a small C extension.
 
-It leaves out the anchors that are too far away to count. Where it could not be built, `is_available` is false.
+It leaves out the anchors that are too far away to count. `is_available` is false if the extension could not be built.
 """
 
 from __future__ import annotations
@@ -21,12 +21,14 @@ try:
 except ImportError:  # installed without a C compiler
     _kernel_tree = None  # type: ignore[assignment]
 
-# The weight of all anchors that are left out for being far, relative to the nearest one's.
+# Upper bound for the total weight of the anchors that are left out, relative to the nearest anchor's weight.
 _LEFT_OUT = 1e-7
 
-# Anchors further from the origin than this count as this far; the missing ones of a leaf that is not full are further.
+# Anchor coordinates are clamped to _FARTHEST. _MISSING fills the unused slots of a leaf that is not full.
 _FARTHEST, _MISSING = 5e17, 1e19
-_SMALLEST_SCALE, _LARGEST_SCALE = 1e-30, 1e30  # that leave room for squared distances
+
+# Limits of `exponent_per_square`: its product with a squared distance must fit into a float32.
+_SMALLEST_EXPONENT_PER_SQUARE, _LARGEST_EXPONENT_PER_SQUARE = 1e-30, 1e30
 
 
 def is_available() -> bool:
@@ -36,42 +38,47 @@ def is_available() -> bool:
 
 @dataclass(frozen=True, eq=False)
 class KernelTree:
-    """A binary tree of L leaves, full but for its last level: leaf i is node L - 1 + i, node k has children 2k + 1, 2k + 2.
+    """A binary tree of L leaves that is full except for its last level.
+
+    Leaf i is node L - 1 + i. Node k has the children 2k + 1 and 2k + 2.
 
     Args:
-        leaves: ``(L, D, S)`` the anchors of each leaf, seen from the centre.
-        boxes: ``(2 L - 1, 2, D)`` the lower and the upper corner of the box around each node's anchors, seen from there.
-        centre: ``(D,)``. Float32 resolves differences between points, not their common offset.
-        scale: What turns squared distances into exponents of 2.
-        reach: How many powers of 2 below the nearest anchor's kernel others still count.
+        leaves: ``(L, D, S)`` the anchors of each leaf, relative to the centre.
+        boxes: ``(2 L - 1, 2, D)`` the lower and upper corner of each node's bounding box, relative to the centre.
+        centre: ``(D,)`` the mean of the anchors. Subtracting it keeps float32 precise for points far from the origin.
+        exponent_per_square: log2(e) / 2h^2. Times a squared distance it is the exponent e of a kernel 2^-e.
+        exponent_range: A kernel is left out if it is smaller than 2^-exponent_range times that of the nearest anchor.
     """
 
     leaves: Tensor
     boxes: Tensor
     centre: Tensor
-    scale: float
-    reach: float
+    exponent_per_square: float
+    exponent_range: float
 
     @classmethod
     def of(cls, anchors: Tensor, bandwidth: float) -> KernelTree:
-        """The tree of anchors ``(M, D)``, float32 on the CPU, M >= 1."""
+        """Builds the tree of anchors ``(M, D)``, float32 on the CPU, M >= 1."""
         n_anchors, dim = anchors.shape
         size = _kernel_tree.LEAF_SIZE
         centre = mean(anchors)
         order = torch.empty(n_anchors, dtype=torch.int64)
         _kernel_tree.order_points(anchors.contiguous().numpy(), order.numpy())
-        places = torch.full((-(-n_anchors // size) * size, dim), _MISSING)
-        places[:n_anchors] = (anchors - centre)[order].clamp(-_FARTHEST, _FARTHEST)
-        leaves = places.view(-1, size, dim)
-        # From left to right the leaves of the last level come first, but they have the last numbers.
+        positions = torch.full((-(-n_anchors // size) * size, dim), _MISSING)
+        positions[:n_anchors] = (anchors - centre)[order].clamp(-_FARTHEST, _FARTHEST)
+        leaves = positions.view(-1, size, dim)
+        # From left to right the leaves of the last level come first. In the numbering of nodes they come last.
         full_level = 2 ** (len(leaves).bit_length() - 1)
         leaves = leaves.roll(-2 * (len(leaves) - full_level), dims=0)
         return cls(
             leaves.transpose(1, 2).contiguous(),
             _boxes_around(leaves),
             centre,
-            scale=min(max(math.log2(math.e) / 2 / bandwidth / bandwidth, _SMALLEST_SCALE), _LARGEST_SCALE),
-            reach=math.log2(n_anchors / _LEFT_OUT),
+            exponent_per_square=min(
+                max(math.log2(math.e) / 2 / bandwidth / bandwidth, _SMALLEST_EXPONENT_PER_SQUARE),
+                _LARGEST_EXPONENT_PER_SQUARE,
+            ),
+            exponent_range=math.log2(n_anchors / _LEFT_OUT),
         )
 
     def sums(self, queries: Tensor) -> tuple[Tensor, Tensor]:
@@ -85,52 +92,64 @@ class KernelTree:
         )
         return offsets, log_sums
 
-    def offsets_to(self, targets: KernelTree, queries: Tensor, log_sum: float) -> Tensor:
-        """The way from where the kernels add up to little.
+    def offsets_to(self, targets: KernelTree, queries: Tensor, log_sum_threshold: float) -> Tensor:
+        """The offsets to the nearest target, for queries with a small kernel sum.
 
         Args:
-            targets: Where to.
+            targets: The tree of the target points.
             queries: ``(Q, D)`` float32.
-            log_sum: What counts as little.
+            log_sum_threshold: Log sum above which the offset is zero.
 
         Returns:
-            ``(Q, D)`` offsets to the nearest target; zero where the log sum is above `log_sum`.
+            ``(Q, D)`` offsets to the nearest target; zero where the log sum is above the threshold.
         """
         if torch.compiler.is_compiling():
-            return self.steps_to(targets, queries, log_sum, share=0.0, reach=math.inf)
+            return self.steps_to(targets, queries, log_sum_threshold, share=0.0, max_distance=math.inf)
         queries = queries.contiguous()
         offsets = torch.empty_like(queries)
         _kernel_tree.lead_to_targets(
-            self._held, targets._held, queries.numpy(), log_sum, offsets.numpy(), torch.get_num_threads()
+            self._held,
+            targets._held,
+            queries.numpy(),
+            log_sum_threshold,
+            offsets.numpy(),
+            torch.get_num_threads(),
         )
         return offsets
 
     def steps_to(
-        self, targets: KernelTree, queries: Tensor, log_sum: float, share: float, reach: float
+        self,
+        targets: KernelTree,
+        queries: Tensor,
+        log_sum_threshold: float,
+        share: float,
+        max_distance: float,
     ) -> Tensor:
-        """Steps towards the local mean, and on to a target from where the kernels add up to little.
+        """Steps towards the local mean, and from there towards the nearest target if the kernel sum there is small.
 
         Args:
-            targets: Where to.
+            targets: The tree of the target points.
             queries: ``(Q, D)`` float32.
-            log_sum: What counts as little.
-            share: In [0, 1], how much of the way to the local mean.
-            reach: How far at most towards the nearest target.
+            log_sum_threshold: Log sum at the end of the first part above which there is no part towards a target.
+            share: Fraction in [0, 1] of the offset to the local mean that a step covers.
+            max_distance: Largest length of the part of a step towards the nearest target.
 
         Returns:
             ``(Q, D)`` the steps from the queries.
         """
         if torch.compiler.is_compiling():
-            return _steps_operator(*self._parts, *targets._parts, queries, log_sum, share, reach)
+            return _steps_operator(
+                *self._parts, *targets._parts, queries, log_sum_threshold, share, max_distance
+            )
         queries = queries.contiguous()
         steps = torch.empty_like(queries)
         _kernel_tree.step_to_targets(
             self._held,
             targets._held,
             queries.numpy(),
-            log_sum,
+            log_sum_threshold,
             share,
-            reach,
+            max_distance,
             steps.numpy(),
             torch.get_num_threads(),
         )
@@ -138,26 +157,37 @@ class KernelTree:
 
     @property
     def _parts(self) -> tuple[Tensor, Tensor, Tensor, float, float]:
-        return self.leaves, self.boxes, self.centre, self.scale, self.reach
+        return self.leaves, self.boxes, self.centre, self.exponent_per_square, self.exponent_range
 
     @cached_property
     def _held(self) -> tuple[NDArray, NDArray, NDArray, float, float]:
-        return self.leaves.numpy(), self.boxes.numpy(), self.centre.numpy(), self.scale, self.reach
+        leaves, boxes, centre = (x.numpy() for x in (self.leaves, self.boxes, self.centre))
+        return leaves, boxes, centre, self.exponent_per_square, self.exponent_range
 
 
-# A tree's methods as operators, as which compiled graphs call them. Each is followed by the shapes of what it returns.
+# The methods of a tree as custom operators, which compiled graphs can call. Below each: the shapes of its results.
 
 
 @torch.library.custom_op("lerobot_pf2mp::kernel_sums", mutates_args=(), device_types="cpu")
 def _sums_operator(
-    leaves: Tensor, boxes: Tensor, centre: Tensor, scale: float, reach: float, queries: Tensor
+    leaves: Tensor,
+    boxes: Tensor,
+    centre: Tensor,
+    exponent_per_square: float,
+    exponent_range: float,
+    queries: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    return KernelTree(leaves, boxes, centre, scale, reach).sums(queries)
+    return KernelTree(leaves, boxes, centre, exponent_per_square, exponent_range).sums(queries)
 
 
 @_sums_operator.register_fake
 def _(
-    leaves: Tensor, boxes: Tensor, centre: Tensor, scale: float, reach: float, queries: Tensor
+    leaves: Tensor,
+    boxes: Tensor,
+    centre: Tensor,
+    exponent_per_square: float,
+    exponent_range: float,
+    queries: Tensor,
 ) -> tuple[Tensor, Tensor]:
     return queries.new_empty(queries.shape), queries.new_empty(len(queries))
 
@@ -167,21 +197,23 @@ def _steps_operator(
     leaves: Tensor,
     boxes: Tensor,
     centre: Tensor,
-    scale: float,
-    reach: float,
+    exponent_per_square: float,
+    exponent_range: float,
     target_leaves: Tensor,
     target_boxes: Tensor,
     target_centre: Tensor,
-    target_scale: float,
-    target_reach: float,
+    target_exponent_per_square: float,
+    target_exponent_range: float,
     queries: Tensor,
-    log_sum: float,
+    log_sum_threshold: float,
     share: float,
-    step_reach: float,
+    max_distance: float,
 ) -> Tensor:
-    targets = KernelTree(target_leaves, target_boxes, target_centre, target_scale, target_reach)
-    tree = KernelTree(leaves, boxes, centre, scale, reach)
-    return tree.steps_to(targets, queries, log_sum, share, step_reach)
+    targets = KernelTree(
+        target_leaves, target_boxes, target_centre, target_exponent_per_square, target_exponent_range
+    )
+    tree = KernelTree(leaves, boxes, centre, exponent_per_square, exponent_range)
+    return tree.steps_to(targets, queries, log_sum_threshold, share, max_distance)
 
 
 @_steps_operator.register_fake
@@ -192,12 +224,12 @@ def _(*arguments: Tensor | float) -> Tensor:
 
 
 def _boxes_around(leaves: Tensor) -> Tensor:
-    """The boxes ``(2 L - 1, 2, D)`` of all nodes above leaves ``(L, S, D)``, and of these."""
+    """The bounding boxes ``(2 L - 1, 2, D)`` of all nodes of the tree with leaves ``(L, S, D)``."""
     n_leaves, _, dim = leaves.shape
     boxes = torch.empty(2 * n_leaves - 1, 2, dim)
     boxes[n_leaves - 1 :, 0] = leaves.amin(dim=1)
     boxes[n_leaves - 1 :, 1] = leaves.masked_fill(leaves == _MISSING, -_MISSING).amax(dim=1)
-    end = n_leaves - 1  # from here on boxes are known
+    end = n_leaves - 1  # the boxes of nodes end, end + 1, ... are known
     while end > 0:
         start = end // 2
         children = boxes[2 * start + 1 : 2 * end + 1].view(-1, 2, 2, dim)

@@ -8,24 +8,25 @@ import math
 import torch
 from torch import Tensor
 
-# Pairs (query, anchor) held at once: 2^20 float32 numbers, 4 MB, stay in a core's cache.
+# Pairs (query, anchor) in memory at once: 2^20 float32 numbers, 4 MB, stay in a core's cache.
 PAIRS_PER_BLOCK = 2**20
 
-# The root of float32's largest number, with room for a sum of a thousand squares.
+# Scaled coordinates are clamped to this. A sum of a thousand of its squares still fits into a float32.
 _LARGEST = 5e17
 
 
 def log_kernels(queries: Tensor, anchors: Tensor, bandwidth: float) -> Tensor:
     """The exponents -|q - x|^2 / 2h^2 for all pairs, ``(Q, M)``.
 
-    Differences first, squares after: the expansion |q|^2 - 2 q.x + |x|^2 would lose, for queries many bandwidths from
-    the origin, the digits on which the softmax depends. Autocast must not turn them into bfloat16 either.
+    Differences are taken before squares. For queries many bandwidths from the origin, the expansion
+    |q|^2 - 2 q.x + |x|^2 would lose the digits on which the softmax depends. Autocast is off: bfloat16 would lose them
+    too.
     """
     with torch.autocast(device_type=queries.device.type, enabled=False):
-        scale = 1 / (math.sqrt(2) * bandwidth)
-        # Beyond the limit squares would overflow, and the softmax with them; there the nearest anchor is unknowable.
-        scaled_queries = (queries * scale).clamp(-_LARGEST, _LARGEST)
-        scaled_anchors = (anchors * scale).clamp(-_LARGEST, _LARGEST)
+        factor = 1 / (math.sqrt(2) * bandwidth)
+        # Beyond the limit the squares would overflow, and the softmax with them. There the nearest anchor is unknown.
+        scaled_queries = (queries * factor).clamp(-_LARGEST, _LARGEST)
+        scaled_anchors = (anchors * factor).clamp(-_LARGEST, _LARGEST)
         squares = torch.zeros(len(queries), len(anchors), dtype=torch.float32, device=queries.device)
         for q, x in zip(scaled_queries.unbind(-1), scaled_anchors.unbind(-1), strict=True):
             difference = q.unsqueeze(1) - x.unsqueeze(0)  # (Q, M)
@@ -34,8 +35,8 @@ def log_kernels(queries: Tensor, anchors: Tensor, bandwidth: float) -> Tensor:
 
 
 def offsets_to_nearest(queries: Tensor, anchors: Tensor, bandwidth: float) -> Tensor:
-    """The offsets ``(Q, D)`` from queries ``(Q, D)`` to their nearest anchors, of ``(M, D)``, in blocks of pairs."""
-    # Float32 resolves differences between points, not their common offset.
+    """The offsets ``(Q, D)`` from queries ``(Q, D)`` to the nearest of anchors ``(M, D)``, in blocks of pairs."""
+    # Centred first: float32 resolves differences between points, but not a large common offset.
     centre = anchors[0]
     centred = anchors - centre
     return torch.cat(
@@ -47,15 +48,18 @@ def offsets_to_nearest(queries: Tensor, anchors: Tensor, bandwidth: float) -> Te
 
 
 def mean(points: Tensor) -> Tensor:
-    """The mean ``(D,)`` of points ``(M, D)`` in double precision, which not every device has, as float32."""
+    """The mean ``(D,)`` of points ``(M, D)`` as float32.
+
+    It is computed in double precision on the CPU, because not every device has double precision.
+    """
     return points.cpu().double().mean(dim=0).float().to(points.device)
 
 
 def log_sum_exp(exponents: Tensor) -> Tensor:
     """The log-sum-exp over the last dimension, ``(Q, M)`` to ``(Q,)``.
 
-    From the largest softmax weight, exp(max - lse): torch.softmax does not suffer from underflowing exponents, on
-    which torch.logsumexp is several times slower on a CPU (denormal numbers).
+    It is computed from the largest softmax weight, exp(max - lse). On a CPU torch.logsumexp is several times slower
+    where exponents underflow (denormal numbers); torch.softmax is not.
     """
     largest_weight = torch.softmax(exponents, dim=-1).amax(dim=-1)
     return exponents.amax(dim=-1) - largest_weight.log()

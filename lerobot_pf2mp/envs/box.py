@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Boxes with sides along the axes, and which ways they block."""
+"""Boxes with sides along the axes, and whether they block a line segment."""
 
 from __future__ import annotations
 
@@ -39,7 +39,11 @@ class Box:
         return cls((*centre.tolist(),), (*size.tolist(),))
 
     def grown_by(self, moving: Box) -> Box:
-        """Where the origin of `moving`, given relative to it, may not be if the two must not overlap (Minkowski sum)."""
+        """The positions of the origin of `moving` at which it overlaps this box (Minkowski sum).
+
+        Args:
+            moving: A box, relative to its own origin.
+        """
         return Box.between(self.low - moving.high, self.high - moving.low)
 
     def contains(self, points: np.ndarray) -> np.ndarray:
@@ -47,15 +51,15 @@ class Box:
         return np.all((points > self.low) & (points < self.high), axis=-1)
 
     def blocks(self, start: np.ndarray, end: np.ndarray) -> bool:
-        """Whether the straight way between ``(3,)`` points [m] passes through the inside.
+        """Whether the line segment between two ``(3,)`` points [m] passes through the inside.
 
         The slab test of Kay and Kajiya (1986).
         """
-        way = np.asarray(end, dtype=float) - start
-        is_flat = way == 0
+        offset = np.asarray(end, dtype=float) - start
+        is_flat = offset == 0
         if np.any(is_flat & ((start <= self.low) | (start >= self.high))):
             return False
-        step = np.where(is_flat, 1.0, way)
+        step = np.where(is_flat, 1.0, offset)
         ends = np.stack([(self.low - start) / step, (self.high - start) / step])
         enters = np.where(is_flat, -np.inf, ends.min(axis=0)).max()
         leaves = np.where(is_flat, np.inf, ends.max(axis=0)).min()

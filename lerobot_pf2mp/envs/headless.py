@@ -9,17 +9,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from ctypes.util import find_library
 
-_WHAT_TO_INSTALL = (
+_HOW_TO_INSTALL = (
     "rendering without a screen needs EGL or OSMesa: install libegl1 and libgl1-mesa-dri, or libosmesa6"
 )
 
 
 @contextmanager
 def rendering() -> Iterator[None]:
-    """Lets MuJoCo render in the block: on a machine without a screen by EGL, else OSMesa, unless MUJOCO_GL chooses.
+    """Lets MuJoCo render inside a `with` block.
+
+    Without a screen it renders with EGL, or else with OSMesa, unless MUJOCO_GL names a backend.
 
     Raises:
-        RuntimeError: If rendering is not possible; says what to install.
+        RuntimeError: If rendering is not possible; the message says what to install.
     """
     has_screen = sys.platform != "linux" or any(
         os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
@@ -31,7 +33,7 @@ def rendering() -> Iterator[None]:
     except Exception as error:
         chosen = os.environ.get("MUJOCO_GL", "unset")
         raise RuntimeError(
-            f"{_WHAT_TO_INSTALL}; got {type(error).__name__} with MUJOCO_GL {chosen}: {error}"
+            f"{_HOW_TO_INSTALL}; got {type(error).__name__} with MUJOCO_GL {chosen}: {error}"
         ) from error
 
 
@@ -39,4 +41,4 @@ def _offscreen_backend() -> str:
     for library, backend in (("EGL", "egl"), ("OSMesa", "osmesa")):
         if find_library(library):
             return backend
-    raise RuntimeError(f"{_WHAT_TO_INSTALL}; got neither")
+    raise RuntimeError(f"{_HOW_TO_INSTALL}; got neither")

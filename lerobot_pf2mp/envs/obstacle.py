@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Contact with an obstacle, and the distance to it, in a MuJoCo model."""
+"""Contacts with an obstacle in a MuJoCo model, and the distance to it."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from contextlib import contextmanager
 import mujoco
 import numpy as np
 
-_FARTHEST = 2.0  # [m]; distances beyond are not told apart
+_FARTHEST = 2.0  # largest distance that is measured [m]
 _SHIFTS = 1e-6 * np.array([(1, 2, 3), (0, 1, 0), (-2, 1, -1), (3, -1, 2), (-1, -3, 1), (2, 3, -2)])  # [m]
 
 
 class Obstacle:
-    """A geom that others must not touch.
+    """A geom that other geoms must not touch.
 
     Args:
         model: The MuJoCo model.
@@ -33,7 +33,7 @@ class Obstacle:
 
     @contextmanager
     def passable(self) -> Iterator[None]:
-        """Within the block nothing is stopped by it."""
+        """Switches off all contacts with the obstacle inside a `with` block."""
         model, geom = self._model, self._geom
         contype, conaffinity = model.geom_contype[geom], model.geom_conaffinity[geom]
         model.geom_contype[geom] = model.geom_conaffinity[geom] = 0
@@ -43,7 +43,7 @@ class Obstacle:
             model.geom_contype[geom], model.geom_conaffinity[geom] = contype, conaffinity
 
     def contact_depth(self) -> float:
-        """How deep something has pressed into the obstacle in the last physics step [m]; at most 0 without contact."""
+        """The largest penetration of a mover into the obstacle in the last physics step [m]; at most 0 without contact."""
         if not self._data.ncon:
             return 0.0
         contact = self._data.contact
@@ -62,13 +62,13 @@ class Obstacle:
         distance = mujoco.mj_geomDistance(model, data, self._geom, mover, _FARTHEST, self._segment)
         if distance != 0:
             return distance
-        # MuJoCo 3.11 returns exactly 0 for about one pair in a hundred that is well apart; a micrometre aside it does not.
-        place = data.geom_xpos[self._geom]
-        before = place.copy()
+        # MuJoCo 3.11 returns exactly 0 for about 1 % of the pairs that are well apart. A shift by micrometres avoids this.
+        position = data.geom_xpos[self._geom]
+        before = position.copy()
         for shift in _SHIFTS:
-            place[:] = before + shift
+            position[:] = before + shift
             distance = mujoco.mj_geomDistance(model, data, self._geom, mover, _FARTHEST, self._segment)
             if distance != 0:
                 break
-        place[:] = before
+        position[:] = before
         return distance

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures; the only user of matplotlib. What is drawn comes from `figures.py`.
+"""Figures; the only user of matplotlib. `policy_figures.py` collects their contents.
 
 Importing this package does not import matplotlib; drawing does.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chunks on their way from noise to paths."""
+"""An animation of chunks that move from noise to trajectories."""
 
 from __future__ import annotations
 
@@ -34,12 +34,14 @@ def animate_flow(
     goals: np.ndarray | None,
     background: str = "light",
 ) -> None:
-    """Writes an animation of chunks moving from noise to paths, without and with guidance, over the field's arrows.
+    """Writes an animation of chunks that move from noise to trajectories, without and with guidance.
+
+    The arrows of the potential field are in the background.
 
     Args:
         output: The GIF file to write.
-        scene: Where the chunks live; its field is drawn.
-        unguided: ``(N + 1, B, T, 2)`` chunks after each step [normalised], beginning with the noise.
+        scene: The scene of the chunks; its field is drawn.
+        unguided: ``(N + 1, B, T, 2)`` chunks after each step [normalised], starting with the noise.
         guided: ``(N + 1, B, T, 2)`` the same with guidance.
         starts: ``(B, 2)`` starts [m].
         goals: ``(B, 2)`` goals [m]; None if there are none.
@@ -71,8 +73,8 @@ class _Panel:
     """One half of the animation.
 
     Args:
-        axis: Where it is drawn.
-        name: The first words of its title.
+        axis: Axes of the panel.
+        name: First words of its title.
         steps: ``(N + 1, B, T, 2)`` chunks after each step [m].
         lines: One for each of the B chunks.
     """
@@ -84,7 +86,7 @@ class _Panel:
 
     @classmethod
     def empty(cls, axis: Axes, name: str, steps: np.ndarray) -> _Panel:
-        """The panel before the first frame."""
+        """Makes the panel before the first frame."""
         lines = [
             axis.plot([], [], ".-", color=f"C{i}", markersize=5, markeredgewidth=0, zorder=5)[0]
             for i in range(steps.shape[1])
@@ -92,7 +94,7 @@ class _Panel:
         return cls(axis, name, steps, lines)
 
     def show(self, time: float) -> None:
-        """Shows the chunks after `time` steps, which need not be whole."""
+        """Shows the chunks after `time` steps. The number may be fractional: then they are interpolated."""
         n_steps = len(self.steps) - 1
         step = min(int(time), n_steps - 1)
         now = self.steps[step] + (time - step) * (self.steps[step + 1] - self.steps[step])
@@ -113,6 +115,6 @@ def _draw_background(
 
 
 def _times(n_steps: int) -> list[float]:
-    """When in the flow each frame is [steps]; at both ends there is time to look at the noise and at the result."""
+    """The time of each frame in the flow [steps]. The first and the last frame are repeated, to show noise and result."""
     n_between = max(1, round(30 / n_steps))
     return [0.0] * 6 + [*np.linspace(0, n_steps, n_steps * n_between + 1), *[n_steps] * 15]

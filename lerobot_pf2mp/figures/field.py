@@ -17,12 +17,12 @@ from lerobot_pf2mp.potential_field import PotentialField
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Nothing is drawn where the density is this far below its peak [nats]: there the field is all tail.
+# The density is not drawn where it is this far below its peak [nats], in the tails of the kernels.
 _DENSITY_RANGE = 12.0
 
 
 def plot_density(output: Path, *, scene: Scene, background: str = "light") -> None:
-    """Draws the log density of the demonstrated actions, and the anchors it is made of."""
+    """Draws the log density of the demonstrated actions, and its anchors."""
     theme = THEMES[background]
     field = planar_field(scene)
     with themed_figure(output, theme, _panel_size(scene, 0.75), layout="constrained") as figure:
@@ -35,7 +35,7 @@ def plot_density(output: Path, *, scene: Scene, background: str = "light") -> No
 
 
 def plot_arrows(output: Path, *, scene: Scene, background: str = "light") -> None:
-    """Draws the direction of the potential's gradient, which points to where demonstrations went."""
+    """Draws the direction of the potential's gradient, which points towards the demonstrations."""
     theme = THEMES[background]
     planar_field(scene)
     with themed_figure(output, theme, _panel_size(scene, 0.75), layout="constrained") as figure:
@@ -49,7 +49,7 @@ def planar_field(scene: Scene) -> PotentialField:
     """The scene's potential field.
 
     Raises:
-        ValueError: If it has none, or one that is not over two action dimensions.
+        ValueError: If the scene has no field, or one that is not over two action dimensions.
     """
     if scene.field is None or scene.field.dim != 2:
         found = "none" if scene.field is None else f"one over {scene.field.dim}"
@@ -58,7 +58,7 @@ def planar_field(scene: Scene) -> PotentialField:
 
 
 def draw_density(axis: Axes, scene: Scene) -> Any:
-    """Draws the log density [nats] and the anchors, and returns matplotlib's mesh for a colour bar."""
+    """Draws the log density [nats] and the anchors. Returns matplotlib's mesh for a colour bar."""
     field = planar_field(scene)
     left, right, *_ = scene.extent
     x, y, actions, _ = _grid(scene, per_metre=240 / (right - left))
@@ -75,22 +75,22 @@ def draw_density(axis: Axes, scene: Scene) -> Any:
 def draw_arrows(
     axis: Axes, scene: Scene, theme: Theme, per_metre: float | None = None, alpha: float = 1.0
 ) -> None:
-    """Draws arrows of one length in which the potential's gradient moves an action.
+    """Draws arrows of equal length in the direction of the potential's gradient.
 
     Args:
-        axis: Where to draw.
+        axis: Axes to draw on.
         scene: A scene with a field over two action dimensions.
         theme: The colours.
-        per_metre: Arrows on a metre; by default 36 on the scene's width.
+        per_metre: Number of arrows per metre; by default 36 over the scene's width.
         alpha: Their opacity.
     """
     field = planar_field(scene)
     left, right, *_ = scene.extent
     per_metre = per_metre or 36 / (right - left)
-    x, y, actions, scale = _grid(scene, per_metre)
+    x, y, actions, metres_per_unit = _grid(scene, per_metre)
     log_density = field.log_density(actions).numpy()
-    # Phi is a gradient in normalised units; as a step it points in the direction of Phi times metres for each unit.
-    steps = field.potential_gradient(actions).numpy() * scale
+    # Phi is a gradient in normalised units. As a step in metres it is multiplied by metres per unit.
+    steps = field.potential_gradient(actions).numpy() * metres_per_unit
     directions = steps / np.linalg.norm(steps, axis=-1, keepdims=True).clip(min=1e-9)
     shown = log_density > log_density.max() - 4 * _DENSITY_RANGE
     grid_x, grid_y = np.meshgrid(x, y)
@@ -118,11 +118,11 @@ def _panel_size(scene: Scene, share: float) -> tuple[float, float]:
 
 
 def _grid(scene: Scene, per_metre: float) -> tuple[np.ndarray, np.ndarray, Tensor, np.ndarray]:
-    """A grid of positions over the scene: x and y [m], their normalised actions, and metres for one normalised unit."""
+    """A grid of positions over the scene: x and y [m], their normalised actions, and metres per normalised unit."""
     left, right, bottom, top = scene.extent
     x = left + (np.arange(round((right - left) * per_metre)) + 0.5) / per_metre
     y = bottom + (np.arange(round((top - bottom) * per_metre)) + 0.5) / per_metre
     zero = scene.to_metres(torch.zeros(1, 2)).double().numpy()[0]
-    scale = scene.to_metres(torch.ones(1, 2)).double().numpy()[0] - zero
+    metres_per_unit = scene.to_metres(torch.ones(1, 2)).double().numpy()[0] - zero
     positions = np.stack(np.meshgrid(x, y), axis=-1)
-    return x, y, torch.from_numpy((positions - zero) / scale).float(), scale
+    return x, y, torch.from_numpy((positions - zero) / metres_per_unit).float(), metres_per_unit

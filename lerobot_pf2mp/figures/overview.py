@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 
 
 def plot_maze_overview(output: Path, *, scene: Scene, pair: PathPair, background: str = "light") -> None:
-    """Draws Figure 3 of the paper: maze, density map, potential field, and the same start and noise without and with it.
+    """Draws Figure 3 of the paper: maze, density, potential field, and an episode without and with guidance.
+
+    Both have the same start and noise.
 
     Args:
         output: The PNG file to write.
@@ -30,7 +32,7 @@ def plot_maze_overview(output: Path, *, scene: Scene, pair: PathPair, background
     if scene.maze_map is None:
         raise ValueError("the overview needs a maze, got another environment")
     aspect = len(scene.maze_map) / len(scene.maze_map[0])
-    # Three panels above, two below: at the width of a README five in a row would be too small to read.
+    # Three panels above, two below: five in a row would be too small at the width of a README.
     width = 12.0
     with themed_figure(output, theme, (width, width / 3 * 2 * aspect + 0.9)) as figure:
         axes = _panels(figure)
@@ -45,16 +47,16 @@ def plot_maze_overview(output: Path, *, scene: Scene, pair: PathPair, background
         draw_density(axes[1], scene)
         axes[2].set_title("(c) potential field")
         draw_arrows(axes[2], scene, theme)
-        _draw_ways(axes[3:], pair, theme)
+        _draw_paths(axes[3:], pair, theme)
 
 
 def _panels(figure: Figure) -> list[Axes]:
     grid = figure.add_gridspec(2, 6, hspace=0.17, wspace=0.12, left=0.01, right=0.99, top=0.94, bottom=0.02)
-    places = ((0, 0), (0, 2), (0, 4), (1, 1), (1, 3))
-    return [figure.add_subplot(grid[row, column : column + 2]) for row, column in places]
+    corners = ((0, 0), (0, 2), (0, 4), (1, 1), (1, 3))
+    return [figure.add_subplot(grid[row, column : column + 2]) for row, column in corners]
 
 
-def _draw_ways(axes: list[Axes], pair: PathPair, theme: Theme) -> None:
+def _draw_paths(axes: list[Axes], pair: PathPair, theme: Theme) -> None:
     for axis, path, colour, name in (
         (axes[0], pair.unguided, theme.unguided, "(d) FMP, no guidance"),
         (axes[1], pair.guided, GUIDED, "(e) PF2MP, same start and noise"),

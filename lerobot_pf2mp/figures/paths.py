@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ways through a scene, in the plane or in space."""
+"""Executed trajectories through a scene, in the plane or in space."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Path2D:
-    """A way through a scene.
+    """An executed trajectory through a scene.
 
     Args:
-        positions: ``(N + 1, D)`` positions [m]; D >= 2, of which three are drawn.
+        positions: ``(N + 1, D)`` positions [m], D >= 2. At most three coordinates are drawn.
         collisions: ``(N,)`` true for the steps that collide.
     """
 
@@ -32,11 +32,11 @@ class PathPair:
     """The same episode, from the same noise, without and with guidance.
 
     Args:
-        episode: Its number.
-        unguided: The way without guidance.
-        guided: The way with guidance.
+        episode: Number of the episode.
+        unguided: The trajectory without guidance.
+        guided: The trajectory with guidance.
         goal: ``(D,)`` the goal [m]; None if the environment has none.
-        n_side_by_side: Episodes that ran side by side with it, on which their noise depends.
+        n_side_by_side: Number of episodes that ran in parallel. The noise depends on it.
     """
 
     episode: int
@@ -47,13 +47,13 @@ class PathPair:
 
 
 def draw_path(axis: Axes, path: Path2D, colour: str, label: str | None = None) -> None:
-    """Draws a way, with a cross after each step that collides.
+    """Draws a trajectory, with a cross after each step that collides.
 
     Args:
-        axis: Where to draw.
-        path: The way.
+        axis: Axes to draw on.
+        path: The trajectory.
         colour: Its colour.
-        label: Its name in the legend; None for none.
+        label: Its name in the legend; None leaves it out.
     """
     axis.plot(
         *_coordinates(path.positions),
@@ -69,13 +69,13 @@ def draw_path(axis: Axes, path: Path2D, colour: str, label: str | None = None) -
 
 
 def mark_ends(axis: Axes, start: np.ndarray, goal: np.ndarray | None, size: float = 11) -> None:
-    """Marks where a way starts and where it should end.
+    """Marks the start and the goal of a trajectory.
 
     Args:
-        axis: Where to draw.
+        axis: Axes to draw on.
         start: ``(D,)`` the start [m].
         goal: ``(D,)`` the goal [m]; None if there is none.
-        size: Of the marks [points].
+        size: Size of the marks [points].
     """
     style: dict[str, Any] = {"linestyle": "none", "markersize": size, "markeredgecolor": "white", "zorder": 6}
     axis.plot(*_coordinates(start), marker="*", color=START, label="start", **style)
@@ -84,6 +84,6 @@ def mark_ends(axis: Axes, start: np.ndarray, goal: np.ndarray | None, size: floa
 
 
 def _coordinates(positions: np.ndarray) -> list[np.ndarray]:
-    """At most three coordinates of ``(..., D)`` positions, as matplotlib wants them."""
+    """At most three coordinates of ``(..., D)`` positions, one array for each, for matplotlib."""
     positions = np.atleast_2d(positions)
     return [positions[:, i] for i in range(min(3, positions.shape[1]))]

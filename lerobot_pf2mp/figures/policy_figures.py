@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gathers what the figures show, from results and checkpoints."""
+"""Collects the contents of the figures from results and checkpoints."""
 
 from __future__ import annotations
 
@@ -36,20 +36,20 @@ from lerobot_pf2mp.results.summary import group_cells
 
 FIGURES = ("lambda", "density", "arrows", "trajectories", "overview", "strokes", "flow", "video")
 
-_N_SEARCHED = 100
+_N_SEARCHED = 100  # episodes among which the clearest ones are chosen
 
 
 def make_lambda_figure(results: Sequence[Path], output: Path, *, task: str | None, background: str) -> None:
-    """Draws rates against lambda from one or several benchmarks' ``summary.csv``.
+    """Draws rates against lambda, from the ``summary.csv`` of one or several benchmarks.
 
     Args:
         results: The files, or their folders.
         output: The PNG file to write.
-        task: Which task's results to draw; None if there is only one.
+        task: The task whose results are drawn; None if there is only one.
         background: light or dark.
 
     Raises:
-        ValueError: If the results are of several tasks and none is named, or none is guided.
+        ValueError: If the results are of several tasks and `task` is None, or no result is guided.
         FileNotFoundError: If there is no such file.
     """
     rows: list[SummaryRow] = []
@@ -90,13 +90,13 @@ class GuidedPolicyFigures:
     def draw(
         self, figure: str, output: Path, n_episodes: int, episodes: Sequence[int], background: str
     ) -> None:
-        """Writes one of `FIGURES` but lambda.
+        """Writes one of `FIGURES` except lambda.
 
         Args:
             figure: Its name.
             output: The file to write.
-            n_episodes: How many episodes to draw if none are named; for flow, how many chunks.
-            episodes: Which episodes to draw.
+            n_episodes: Number of episodes to draw if `episodes` is empty; for flow, number of chunks.
+            episodes: Numbers of the episodes to draw.
             background: light or dark.
 
         Raises:
@@ -119,7 +119,7 @@ class GuidedPolicyFigures:
         elif figure == "video":
             (pair,) = self.path_pairs(1, episodes[:1])
             write_comparison(
-                output, *self.film(pair), collisions=_first_collisions(pair), background=background
+                output, *self.video_frames(pair), collisions=_first_collisions(pair), background=background
             )
         else:
             unguided, guided, starts, goals = self.trace_flow(n_episodes)
@@ -147,12 +147,12 @@ class GuidedPolicyFigures:
         return Scene(self._postprocess, field, obstacles=[env.wall] if isinstance(env, PF2MPFetchEnv) else ())
 
     def path_pairs(self, n_pairs: int, episodes: Sequence[int] = ()) -> list[PathPair]:
-        """Episodes without and with guidance, from the same start and prior noise.
+        """Runs episodes without and with guidance, from the same start and prior noise.
 
         Args:
-            n_pairs: How many to return.
-            episodes: Which; by default, of the first hundred, those in which guidance prevents a collision, and then
-                those with the longest way.
+            n_pairs: Number of pairs to return.
+            episodes: Numbers of the episodes. By default they are chosen from the first hundred: first those in which
+                guidance prevents a collision, then those with the longest path.
         """
         n_episodes = max(episodes) + 1 if episodes else _N_SEARCHED
         unguided, goals = self._roll_out(n_episodes, 0.0)
@@ -160,27 +160,27 @@ class GuidedPolicyFigures:
         pairs = [PathPair(i, unguided[i], guided[i], goals[i], n_episodes) for i in range(n_episodes)]
         if episodes:
             return [pairs[i] for i in episodes]
-        return sorted(pairs, key=_how_telling, reverse=True)[:n_pairs]
+        return sorted(pairs, key=_clarity, reverse=True)[:n_pairs]
 
-    def film(self, pair: PathPair) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Pictures ``(H, W, 3)`` uint8 of an episode, before the first and after each step, without and with guidance."""
-        films = []
-        for scale, path in ((0.0, pair.unguided), (self._config.guidance_scale, pair.guided)):
-            film: list[np.ndarray] = []
+    def video_frames(self, pair: PathPair) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Images ``(H, W, 3)`` uint8 of an episode, before the first and after each step, without and with guidance."""
+        videos = []
+        for guidance_scale, path in ((0.0, pair.unguided), (self._config.guidance_scale, pair.guided)):
+            frames: list[np.ndarray] = []
 
-            def take_picture(env: Any, film: list[np.ndarray] = film) -> None:
-                film.append(env.envs[pair.episode].render())
+            def add_frame(env: Any, frames: list[np.ndarray] = frames) -> None:
+                frames.append(env.envs[pair.episode].render())
 
-            # Prior noise depends on how many episodes run side by side.
-            self._roll_out(pair.n_side_by_side, scale, take_picture)
-            films.append(film[: len(path.positions)])
-        return films[0], films[1]
+            # Prior noise depends on the number of episodes that run in parallel.
+            self._roll_out(pair.n_side_by_side, guidance_scale, add_frame)
+            videos.append(frames[: len(path.positions)])
+        return videos[0], videos[1]
 
     def trace_flow(self, n_chunks: int) -> tuple[Tensor, Tensor, np.ndarray, np.ndarray | None]:
-        """One chunk for each of several episodes, step by step, without and with guidance.
+        """Generates one chunk for each of several episodes and records each step, without and with guidance.
 
         Args:
-            n_chunks: Episodes B.
+            n_chunks: Number of episodes B.
 
         Returns:
             ``(N + 1, B, T, A)`` chunks without and with guidance [normalised], ``(B, D)`` starts [m], and ``(B, D)`` goals
@@ -211,10 +211,10 @@ class GuidedPolicyFigures:
         return env
 
     def _roll_out(
-        self, n_episodes: int, scale: float, film: Callable[[Any], None] | None = None
+        self, n_episodes: int, guidance_scale: float, on_step: Callable[[Any], None] | None = None
     ) -> tuple[list[Path2D], list[np.ndarray | None]]:
         configured = self._config.guidance_scale
-        self._config.guidance_scale = scale
+        self._config.guidance_scale = guidance_scale
         env_processors = make_env_pre_post_processors(self._env, self._config)
         env = self._make_env(n_episodes)
         pens: list[np.ndarray] = []
@@ -222,14 +222,12 @@ class GuidedPolicyFigures:
         def watch(env: Any) -> None:
             if isinstance(self._env, PF2MPHandwritingEnv):
                 pens.append(np.array([each.unwrapped.pen[:2] for each in env.envs]))
-            if film is not None:
-                film(env)
+            if on_step is not None:
+                on_step(env)
 
         try:
-            with (
-                seeded_prior_noise(self._policy, 0),
-                redirect_stderr(io.StringIO()),
-            ):  # LeRobot's progress bar
+            # stderr gets LeRobot's progress bar.
+            with seeded_prior_noise(self._policy, 0), redirect_stderr(io.StringIO()):
                 result = rollout(
                     env,
                     self._policy,
@@ -245,11 +243,11 @@ class GuidedPolicyFigures:
             self._config.guidance_scale = configured
         observations = result["observation"]
         lengths = result["done"].int().argmax(dim=1) + 1
-        # Joint positions are no way through a scene; the pen's are.
-        ways = np.stack(pens, axis=1) if pens else observations[OBS_STATE].numpy()
+        # Joint positions cannot be drawn in a scene; positions of the pen can.
+        trajectories = np.stack(pens, axis=1) if pens else observations[OBS_STATE].numpy()
         paths = [
-            Path2D(way[: length + 1], (rewards[:length] < 0).numpy())
-            for way, rewards, length in zip(ways, result["reward"], lengths, strict=True)
+            Path2D(positions[: length + 1], (rewards[:length] < 0).numpy())
+            for positions, rewards, length in zip(trajectories, result["reward"], lengths, strict=True)
         ]
         has_goals = OBS_ENV_STATE in observations
         goals = [observations[OBS_ENV_STATE][i, 0].numpy() if has_goals else None for i in range(n_episodes)]
@@ -257,7 +255,7 @@ class GuidedPolicyFigures:
 
 
 class _Trace:
-    """A guide that notes every step, and leaves it to another one or unguided."""
+    """A guide that records every step. It passes the step to another guide, or leaves it unguided."""
 
     def __init__(self, guide: Any) -> None:
         self.chunks: list[Tensor] = []
@@ -270,13 +268,13 @@ class _Trace:
         return x_next
 
 
-def _how_telling(pair: PathPair) -> tuple[bool, float]:
+def _clarity(pair: PathPair) -> tuple[bool, float]:
     length = np.linalg.norm(np.diff(pair.guided.positions, axis=0), axis=1).sum()
     return bool(pair.unguided.collisions.any() and not pair.guided.collisions.any()), float(length)
 
 
 def _first_collisions(pair: PathPair) -> tuple[int | None, int | None]:
-    """After which step each of the two first collides."""
+    """The number of the first step with a collision, without and with guidance; None without a collision."""
     steps = [np.flatnonzero(path.collisions) for path in (pair.unguided, pair.guided)]
     first, second = (int(at[0]) + 1 if at.size else None for at in steps)
     return first, second

@@ -22,7 +22,7 @@ def plot_lambda(output: Path, *, cells: Sequence[Cell], background: str = "light
 
     Args:
         output: The PNG file to write.
-        cells: Results of one task: guided policies at several lambda, and their unguided twins.
+        cells: Results of one task: guided policies with several values of lambda, and the same policies without guidance.
         background: One of `THEMES`.
 
     Raises:

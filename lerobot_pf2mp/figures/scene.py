@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the actions of a policy live, in the plane."""
+"""The scene in which the actions of a policy are drawn."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Scene:
-    """Where the actions of a policy live.
+    """The scene in which the actions of a policy are drawn.
 
     Args:
         to_metres: Maps ``(..., D)`` normalised actions to positions [m], each axis linearly.
         field: The potential field [normalised]; None for a policy without one.
-        maze_map: Rows of 0 (free) and 1 (wall), north first; None in an environment that is no maze.
+        maze_map: Rows of 0 (free) and 1 (wall), north first; None if the environment is not a maze.
         obstacles: Boxes that must not be touched [m].
-        writing: The letter and its restricted regions; None where nothing is written.
+        writing: The letter and its restricted regions; None if the environment is not handwriting.
     """
 
     to_metres: Callable[[Tensor], Tensor]
@@ -40,7 +40,7 @@ class Scene:
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """What is drawn: left, right, bottom and top [m]."""
+        """The limits of the drawing: left, right, bottom and top [m]."""
         if self.maze_map is not None:
             rows, columns = len(self.maze_map), len(self.maze_map[0])
             return -columns / 2, columns / 2, -rows / 2, rows / 2
@@ -52,9 +52,9 @@ class Scene:
         return _around(self.to_metres(self.field.anchors).numpy()[:, :2])
 
 
-def _around(places: np.ndarray) -> tuple[float, float, float, float]:
-    margin = 0.1 * np.ptp(places, axis=0)
-    (left, bottom), (right, top) = places.min(axis=0) - margin, places.max(axis=0) + margin
+def _around(positions: np.ndarray) -> tuple[float, float, float, float]:
+    margin = 0.1 * np.ptp(positions, axis=0)
+    (left, bottom), (right, top) = positions.min(axis=0) - margin, positions.max(axis=0) + margin
     return float(left), float(right), float(bottom), float(top)
 
 
@@ -62,7 +62,7 @@ def draw_scene(axis: Axes, scene: Scene, theme: Theme, with_ticks: bool = False)
     """Draws the walls of a maze, or the letter and its regions, and sets the axes to the scene's extent.
 
     Args:
-        axis: Where to draw.
+        axis: Axes to draw on.
         scene: The scene.
         theme: The colours.
         with_ticks: Whether the axes have ticks and labels [m].

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Axes in space, with obstacles."""
+"""Axes in three dimensions, with obstacles."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from lerobot_pf2mp.figures.theme import COLLISION, Theme
 
 
 def draw_space(axis: Any, scene: Scene, pair: PathPair, theme: Theme) -> None:
-    """Scales axes in space equally, around an episode and the obstacles, and draws these.
+    """Draws the obstacles, and sets equal units and limits around them and an episode on axes in three dimensions.
 
     Args:
         axis: Axes with the projection 3d.
-        scene: Where the episode took place.
-        pair: The episode, of three coordinates or more.
+        scene: The scene of the episode.
+        pair: The episode, with three coordinates or more.
         theme: The colours.
     """
     from matplotlib.ticker import MaxNLocator

@@ -12,7 +12,7 @@ from lerobot_pf2mp.figures.theme import COLLISION, GUIDED, THEMES, WIDTH, themed
 
 
 def plot_strokes(output: Path, *, scene: Scene, pairs: Sequence[PathPair], background: str = "light") -> None:
-    """Draws what was written in several episodes, without and with guidance, from the same starts and noise.
+    """Draws the strokes of several episodes, without and with guidance, from the same starts and noise.
 
     Args:
         output: The PNG file to write.
@@ -21,7 +21,7 @@ def plot_strokes(output: Path, *, scene: Scene, pairs: Sequence[PathPair], backg
         background: One of `THEMES`.
 
     Raises:
-        ValueError: If nothing is written in the scene.
+        ValueError: If the environment is not handwriting.
     """
     theme = THEMES[background]
     if scene.writing is None:
@@ -39,7 +39,7 @@ def plot_strokes(output: Path, *, scene: Scene, pairs: Sequence[PathPair], backg
             draw_scene(axis, scene, theme)
             n_collisions = sum(bool(path.collisions.any()) for path in paths)
             axis.set_title(f"{name}\n{n_collisions} of {len(paths)} collide", fontsize=11)
-            # Those that collide are drawn last, so that none is hidden.
+            # Strokes that collide are drawn last, so that they are not hidden.
             for path in sorted(paths, key=_collides):
                 line = COLLISION if _collides(path) else colour
                 axis.plot(*path.positions.T, color=line, linewidth=0.9, alpha=0.6, zorder=4)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Colours, and figures in them."""
+"""Colours, and figures in these colours."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ class Theme:
     """Colours that depend on the background.
 
     Args:
-        background: Of the figure.
-        text: Text, ticks and frames.
-        grid: Grid lines.
-        floor: Free space.
-        wall: Obstacles.
-        unguided: Paths and results without guidance.
-        arrow: Arrows of the potential field.
+        background: Colour of the figure's background.
+        text: Colour of text, ticks and frames.
+        grid: Colour of grid lines.
+        floor: Colour of free space.
+        wall: Colour of obstacles.
+        unguided: Colour of trajectories and results without guidance.
+        arrow: Colour of the arrows of the potential field.
     """
 
     background: str
@@ -59,13 +59,13 @@ THEMES = {
 def themed_figure(
     output: Path | None, theme: Theme, size: tuple[float, float], layout: Any = None
 ) -> Iterator[Figure]:
-    """A figure in the theme's colours, written to a file that appears whole or not at all.
+    """A figure in the theme's colours. Its file appears whole or not at all.
 
     Args:
         output: The PNG file to write; None writes nothing.
         theme: The colours.
         size: Width and height [inches].
-        layout: Matplotlib's layout engine; None places nothing by itself.
+        layout: Matplotlib's layout engine; None for no automatic layout.
 
     Yields:
         The figure, which is closed at the end.

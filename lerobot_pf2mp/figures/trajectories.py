@@ -26,8 +26,8 @@ def plot_trajectories(
 
     Args:
         output: The PNG file to write.
-        scene: Where they took place.
-        pairs: The episodes, one panel each; of positions with three coordinates all three are drawn.
+        scene: The scene of the episodes.
+        pairs: The episodes, one panel each. Positions with three coordinates are drawn in three dimensions.
         background: One of `THEMES`.
     """
     theme = THEMES[background]
@@ -37,7 +37,7 @@ def plot_trajectories(
     left, right, bottom, top = (0.0, 1.0, 0.0, 1.0) if is_3d else scene.extent
     panel = WIDTH / columns
     size = (WIDTH, rows * (panel * (0.92 if is_3d else (top - bottom) / (right - left)) + 0.3) + 0.5)
-    # Axes in space do not tell the constrained layout how far their labels reach.
+    # 3D axes do not report the size of their labels to the constrained layout.
     with themed_figure(output, theme, size, layout=None if is_3d else "constrained") as figure:
         axes = _panels(figure, rows, columns, is_3d)
         for axis in axes.flat[len(pairs) :]:
@@ -68,7 +68,7 @@ def _draw_pair(axis: Axes, pair: PathPair, theme: Theme) -> None:
 
 def _add_legend(figure: Figure, axis: Axes, theme: Theme, is_3d: bool) -> None:
     handles, labels = axis.get_legend_handles_labels()
-    # The first episode need not have a collision to show what its mark looks like.
+    # The mark of a collision is in the legend even if the first episode has none.
     cross = axis.plot(
         [], [], linestyle="none", marker="x", color=COLLISION, markersize=8, markeredgewidth=2.2
     )

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that appear whole, interruptions, and worker processes."""
+"""Atomic files, interruptions, and worker processes."""

@@ -12,13 +12,13 @@ from pathlib import Path
 
 @contextmanager
 def file_written_beside(path: Path) -> Iterator[Path]:
-    """A temporary file beside `path` that takes its place at the end, and vanishes if anything goes wrong.
+    """A temporary file beside `path` that replaces it at the end. After an error it is deleted.
 
     Args:
-        path: The file to be written or replaced; folders on the way to it are made.
+        path: The file to be written or replaced; missing parent folders are made.
 
     Yields:
-        The path of the temporary file, which has the same ending and does not exist yet.
+        The path of the temporary file, which has the same suffix and does not exist yet.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".partial.{path.name}")
@@ -31,13 +31,13 @@ def file_written_beside(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def written_beside(folder: Path, overwrite: bool, *, kind: str, mark: str, option: str) -> Iterator[Path]:
-    """A temporary folder beside `folder` that takes its place at the end, and vanishes if anything goes wrong.
+    """A temporary folder beside `folder` that replaces it at the end. After an error it is deleted.
 
     Args:
         folder: The folder to be written.
-        overwrite: Whether a folder already there is replaced.
-        kind: What the folder holds, for error messages.
-        mark: A file inside by which a folder that may be replaced is known.
+        overwrite: Whether an existing folder is replaced.
+        kind: The kind of folder, for error messages, for example "dataset".
+        mark: A file that marks a folder of this kind. A folder without it is never replaced.
         option: The command-line option that chose the folder, for error messages.
 
     Yields:
@@ -66,12 +66,12 @@ def written_beside(folder: Path, overwrite: bool, *, kind: str, mark: str, optio
     finally:
         shutil.rmtree(workspace, ignore_errors=True)
         for parent in made:
-            with suppress(OSError):  # it holds something, the folder above all
+            with suppress(OSError):  # not empty, for example because it holds the new folder
                 parent.rmdir()
 
 
 def _swap(new: Path, folder: Path, spare: Path) -> None:
-    """Puts `new` in the place of `folder`; if that fails, `folder` is as before."""
+    """Replaces `folder` by `new`; if that fails, `folder` is unchanged."""
     if not folder.exists():
         new.rename(folder)
         return

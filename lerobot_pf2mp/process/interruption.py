@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ctrl-C and SIGTERM, which `kill` and the schedulers of clusters send: both end a command in the same way."""
+"""Handles Ctrl-C and SIGTERM, which `kill` and cluster schedulers send. Both end a command in the same way."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from typing import Any
 INTERRUPTED = 130
 TERMINATED = 143
 
-_AT_ONCE = 1.0  # [s]
+_AT_ONCE = 1.0  # a second SIGTERM within this time is ignored [s]
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM has come; what cleans up after Ctrl-C cleans up after it too."""
+    """Raised by SIGTERM. As a KeyboardInterrupt it runs the same clean-up as Ctrl-C."""
 
 
 @contextmanager
 def sigterm_like_ctrl_c() -> Iterator[None]:
-    """Within the block, in the main thread of this process, SIGTERM raises `Terminated`."""
+    """Lets SIGTERM raise `Terminated` inside a `with` block, in the main thread of this process."""
     process, last = os.getpid(), -math.inf
 
     def terminate(*_: Any) -> None:
         nonlocal last
-        # A process of a library's, forked from this one, ends as it would without us.
+        # A process that a library has forked from this one ends as it would without this handler.
         if os.getpid() != process:
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
             os.kill(os.getpid(), signal.SIGTERM)
             return
         now = time.monotonic()
-        # `timeout` signals the process and then its group; the second time would interrupt the clean-up.
+        # `timeout` signals the process and then its group. The second signal would interrupt the clean-up.
         if now - last > _AT_ONCE:
             last = now
             raise Terminated
@@ -48,5 +48,5 @@ def sigterm_like_ctrl_c() -> Iterator[None]:
 
 
 def exit_code(interruption: KeyboardInterrupt) -> int:
-    """With what code a command ends after an interruption."""
+    """The exit code of a command after an interruption."""
     return TERMINATED if isinstance(interruption, Terminated) else INTERRUPTED

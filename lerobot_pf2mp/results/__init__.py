@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results of a benchmark: rows, what is counted from them, and tables."""
+"""Results of a benchmark: rows, counts and tables."""

@@ -10,11 +10,11 @@ from scipy.stats import binomtest
 
 @dataclass(frozen=True)
 class Rate:
-    """How often something happened, with its 95 % Wilson interval (Wilson, 1927).
+    """The rate of an event, with its 95 % Wilson interval (Wilson, 1927).
 
     Args:
-        count: Events.
-        total: Trials, at least 1.
+        count: Number of events.
+        total: Number of trials, at least 1.
     """
 
     count: int
@@ -22,7 +22,7 @@ class Rate:
 
     @property
     def value(self) -> float:
-        """The share of events."""
+        """The fraction of trials with the event."""
         return self.count / self.total
 
     @property

@@ -27,16 +27,16 @@ class EpisodeRow:
         seed: Seed of the policy's training.
         repeat: Number of the repeat, which seeds the prior noise.
         episode: Number of the start-goal pair.
-        success: Whether the goal was reached, irrespective of collisions.
+        success: Whether the goal was reached, with or without collisions.
         collision: Whether there was a collision.
-        plan_in_wall: Whether an action lay inside an obstacle, which says nothing about the robot around it.
-        min_clearance_m: Smallest distance to an obstacle on the way [m], negative inside.
-        path_length_m: Length of the way [m].
-        stroke_error_mm: Mean distance of what was drawn to what should have been [mm].
+        plan_in_wall: Whether an action lay inside an obstacle. The robot's body may collide without this.
+        min_clearance_m: Smallest distance to an obstacle during the episode [m], negative inside.
+        path_length_m: Length of the executed path [m].
+        stroke_error_mm: Mean distance of the drawn line to the letter [mm].
         steps: Control steps.
-        chunk_latency_ms: Time to plan one chunk for one robot [ms]: the median over several calls, measured once for
+        chunk_latency_ms: Time to generate one chunk for one robot [ms]: the median over several calls, measured once for
             each policy, kind of guidance and repeat.
-        checkpoint: Where the policy was loaded from.
+        checkpoint: Folder or repository from which the policy was loaded.
         commit: Commit of this package; empty if unknown.
     """
 
@@ -62,7 +62,7 @@ class EpisodeRow:
 
 @dataclass(frozen=True)
 class SummaryRow:
-    """What is counted of one repeat of one policy with one kind of guidance.
+    """The counts of one repeat of one policy with one kind of guidance.
 
     Args:
         task: The environment's task.
@@ -72,17 +72,18 @@ class SummaryRow:
         variant: Name of the changes made to the checkpoint's configuration.
         seed: Seed of the policy's training.
         repeat: Number of the repeat.
-        n_episodes: Episodes.
+        n_episodes: Number of episodes.
         successes: Episodes that reached the goal.
         collisions: Episodes with a collision; None if the environment does not report them.
         plans_in_wall: Episodes with an action inside an obstacle; None if the environment does not report it.
-        only_unguided_collides: Episodes in which the unguided twin collides and this one does not; None without a twin.
-        only_guided_collides: Episodes in which this one collides and its twin does not; None without a twin.
+        only_unguided_collides: Episodes that collide without guidance and not with guidance; None if there are no results
+            without guidance.
+        only_guided_collides: Episodes that collide with guidance and not without; None in the same case.
         min_clearance_m: Mean over episodes [m].
         path_length_m: Mean over episodes [m].
         stroke_error_mm: Mean over episodes [mm].
-        chunk_latency_ms: Time to plan one chunk [ms].
-        checkpoint: Where the policy was loaded from.
+        chunk_latency_ms: Time to generate one chunk [ms].
+        checkpoint: Folder or repository from which the policy was loaded.
         commit: Commit of this package.
     """
 
@@ -144,7 +145,7 @@ def read_rows[Row](path: Path, row_type: type[Row]) -> list[Row]:
 
 def _parse_row[Row](line: dict[str, str], fields: dict[str, str], row_type: type[Row]) -> Row:
     values = list(line.values())
-    if None in line or None in values:  # DictReader's marks for too many and too few values
+    if None in line or None in values:  # DictReader's markers for too many and too few values
         raise ValueError(f"a line must have {len(fields)} values, got {values}")
     return row_type(**{name: _parse(line[name], kind) for name, kind in fields.items()})
 

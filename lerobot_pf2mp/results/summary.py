@@ -14,12 +14,13 @@ from lerobot_pf2mp.results.rows import EpisodeRow, SummaryRow
 
 
 def summarise(rows: Iterable[EpisodeRow]) -> list[SummaryRow]:
-    """Counts the episodes of every repeat and pairs each guided one with its unguided twin.
+    """Counts the episodes of every repeat, and pairs each guided episode with its unguided twin.
 
-    The twin is the same checkpoint and variant without guidance, on the same start-goal pairs and prior noise.
+    The twin is the episode of the same checkpoint and variant without guidance, with the same start-goal pair and prior
+    noise.
 
     Args:
-        rows: Episodes.
+        rows: The episodes.
     """
     repeats: dict[tuple[object, ...], list[EpisodeRow]] = {}
     for row in rows:
@@ -103,29 +104,29 @@ class Cell:
 
     @property
     def collision(self) -> Rate | None:
-        """How many of all episodes collide; None if the environment does not report it."""
+        """The rate of episodes with a collision; None if the environment does not report it."""
         return self._rate_if_reported([row.collisions for row in self.repeats])
 
     @property
     def plan_in_wall(self) -> Rate | None:
-        """In how many of all episodes an action lies inside an obstacle; None if the environment does not report it."""
+        """The rate of episodes with an action inside an obstacle; None if the environment does not report it."""
         return self._rate_if_reported([row.plans_in_wall for row in self.repeats])
 
     @property
     def success(self) -> Rate:
-        """How many of all episodes reach the goal."""
+        """The rate of episodes that reach the goal."""
         return Rate(sum(row.successes for row in self.repeats), self.n_episodes)
 
     @property
     def stroke_error(self) -> float | None:
-        """Mean over all episodes [mm]; None if the environment does not report it."""
+        """The mean stroke error over all episodes [mm]; None if the environment does not report it."""
         sums = [
             row.n_episodes * row.stroke_error_mm for row in self.repeats if row.stroke_error_mm is not None
         ]
         return sum(sums) / self.n_episodes if sums else None
 
     def deviation(self, count: str, over: str) -> float | None:
-        """Standard deviation of a rate over repeats or training seeds; None if there is only one.
+        """The standard deviation of a rate over repeats or training seeds; None if there is only one.
 
         Args:
             count: collisions, plans_in_wall or successes.
@@ -148,7 +149,7 @@ class Cell:
     def mcnemar_p(self) -> float | None:
         """Two-sided p-value of McNemar's exact test against the unguided twin; None without one.
 
-        The null hypothesis is that guidance turns as many clear episodes into collisions as the other way round
+        The null hypothesis is that guidance turns as many clear episodes into collisions as collisions into clear episodes
         (McNemar, 1947).
         """
         fixed = [row.only_unguided_collides for row in self.repeats if row.only_unguided_collides is not None]

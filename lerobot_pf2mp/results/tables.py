@@ -27,7 +27,8 @@ def make_markdown(cells: Sequence[Cell]) -> str:
     """A Markdown table, one row for each cell.
 
     Rates are means, with the standard deviation over repeats and over training seeds if there are several. The 95 %
-    interval is Wilson's over all episodes, p that of McNemar's exact test against the same weights without guidance.
+    interval is Wilson's over all episodes. p is the p-value of McNemar's exact test against the same weights without
+    guidance.
     """
     columns, rows = _rows(cells)
     lines = [f"| {' | '.join(columns)} |", f"|{'---|' * len(columns)}"]

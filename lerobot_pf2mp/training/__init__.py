@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training: pf2mp-train, data held in memory, and what all processes of a run share."""
+"""Training: pf2mp-train, datasets in memory, and data shared by the processes of a run."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every process of a training run on several devices has, put together in every one of them."""
+"""Gathers tensors of all processes of a training run on several devices."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from torch import Tensor
 
 
 def gather_rows(*tensors: Tensor | None) -> tuple[Tensor | None, ...]:
-    """The rows of all processes, the same in each of them; in a single process the tensors themselves.
+    """Gathers the rows of all processes, with the same result in each of them. A single process gets its own tensors.
 
-    Every process has to call this, as every one does in a training step. Processes may have different numbers of rows.
+    Every process must call this, as in a training step. Processes may have different numbers of rows.
 
     Args:
-        *tensors: ``(B, ...)`` each, B and device in common; the shape of a row and the type are those of all processes.
-            None, in all processes, stays None.
+        *tensors: ``(B, ...)`` each, with the same B and device. The shape of a row and the type must be the same in all
+            processes. None stays None; it must be None in all processes.
 
     Returns:
-        ``(B_1 + ... + B_n, ...)`` of each, in the order of the processes.
+        ``(B_1 + ... + B_n, ...)`` for each tensor, in the order of the processes.
     """
     if not (dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1):
         return tensors
@@ -28,7 +28,7 @@ def gather_rows(*tensors: Tensor | None) -> tuple[Tensor | None, ...]:
 
 
 def _gather_counted(rows: Tensor, counts: list[int]) -> Tensor:
-    """Collectives exchange equal shapes: rows are added up to the largest count, and taken away again."""
+    """Gathers different numbers of rows. Collectives need equal shapes, so rows are padded to the largest count."""
     padded = rows.new_zeros(max(counts), *rows.shape[1:])
     padded[: len(rows)] = rows
     return torch.cat([part[:count] for part, count in zip(_gather(padded), counts, strict=True)])

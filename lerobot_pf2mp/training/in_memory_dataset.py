@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A LeRobotDataset without cameras, held in memory: the same samples, hundreds of times faster."""
+"""A LeRobotDataset without cameras in memory. It returns the same samples, hundreds of times faster."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from torch.utils.data._utils.collate import default_collate_fn_map
 
 
 class _Sample(dict[str, Any]):
-    """A sample by whose type PyTorch's default collation knows a `SampleBatch`."""
+    """A sample. PyTorch's default collation recognises a `SampleBatch` by this type."""
 
 
 class SampleBatch(Sequence[dict[str, Any]]):
-    """The samples of a batch, which is cut into samples only where somebody asks for them.
+    """The samples of a batch. The batch is split into samples only when they are needed.
 
-    A DataLoader asks for a batch and stacks its samples again, which takes several times longer than reading them; with
-    its default collation it is given the batch as it is.
+    A DataLoader asks for a batch and stacks its samples again, which takes several times longer than reading them. With
+    its default collation it gets the batch unchanged.
 
     Args:
-        tensors: By key ``(B, ...)``.
+        tensors: Tensors ``(B, ...)`` by key.
         tasks: The task of each sample.
     """
 
@@ -46,7 +46,7 @@ class SampleBatch(Sequence[dict[str, Any]]):
         return sample
 
     def collated(self) -> dict[str, Any]:
-        """What PyTorch's default collation makes of the samples: tensors ``(B, ...)``, and the list of tasks."""
+        """The collated samples, as from PyTorch's default collation: tensors ``(B, ...)``, and the list of tasks."""
         return {**self._tensors, "task": self._tasks}
 
 
@@ -56,17 +56,17 @@ def _collate(samples: Sequence[dict[str, Any]], **kwargs: Any) -> dict[str, Any]
     return torch.utils.data.default_collate([dict(sample) for sample in samples])
 
 
-# PyTorch's own place for collating further types.
+# PyTorch's registry for the collation of further types.
 default_collate_fn_map[_Sample] = _collate
 
 
 class InMemoryDataset(torch.utils.data.Dataset):
     """Serves the samples of a LeRobotDataset from tensors in memory.
 
-    Everything but reading samples is left to the wrapped dataset.
+    All other attributes are those of the wrapped dataset.
 
     Args:
-        dataset: A dataset without cameras, its features numeric.
+        dataset: A dataset without cameras and with numeric features.
 
     Raises:
         ValueError: If the dataset cannot be held in memory, see `fits_in_memory`.
@@ -107,7 +107,7 @@ class InMemoryDataset(torch.utils.data.Dataset):
         return self.__getitems__([int(row)])[0]
 
     def __getitems__(self, rows: list[int]) -> SampleBatch:
-        """The samples of several rows; a DataLoader asks for whole batches here."""
+        """The samples of several rows. A DataLoader gets whole batches from this method."""
         index = torch.as_tensor(rows)
         index = torch.where(index < 0, index + len(self), index)
         batch = {key: column[index] for key, column in self._columns.items() if key not in self._windows}
@@ -116,7 +116,7 @@ class InMemoryDataset(torch.utils.data.Dataset):
             wanted = index[:, None] + deltas  # (B, T)
             found = torch.maximum(torch.minimum(wanted, last), first)
             batch[f"{key}_is_pad"] = found != wanted
-            # Half the time of indexing with a (B, T) tensor.
+            # index_select takes half the time of indexing with a (B, T) tensor.
             values = self._columns[key].index_select(0, found.flatten())
             batch[key] = values.unflatten(0, found.shape)
         return SampleBatch(batch, [self._tasks[self._task_of_row[row]] for row in index.tolist()])
@@ -126,8 +126,8 @@ def fits_in_memory(dataset: Any, limit_bytes: float) -> bool:
     """Whether a dataset can be served by `InMemoryDataset`: numeric, without cameras, and within a limit.
 
     Args:
-        dataset: A map-style LeRobotDataset, or anything else, which does not fit.
-        limit_bytes: Most memory that its frames may take [bytes].
+        dataset: A map-style LeRobotDataset. Anything else does not fit.
+        limit_bytes: Largest memory that its frames may take [bytes].
     """
     if not isinstance(dataset, LeRobotDataset) or not _is_numeric(dataset):
         return False
@@ -143,7 +143,7 @@ def _is_numeric(dataset: LeRobotDataset) -> bool:
 
 
 def _to_tensor(column: Any, feature_shape: tuple[int, ...]) -> Tensor:
-    """A column of an Arrow table as a tensor ``(N, *feature_shape)``, in the type that LeRobot's reader gives it."""
+    """A column of an Arrow table as a tensor ``(N, *feature_shape)``, with the type that LeRobot's reader returns."""
     values = column.combine_chunks()
     n_rows = len(values)
     if isinstance(values.type, pa.ExtensionType):
@@ -153,7 +153,7 @@ def _to_tensor(column: Any, feature_shape: tuple[int, ...]) -> Tensor:
     array = torch.from_numpy(values.to_numpy(zero_copy_only=False).copy())
     if tuple(feature_shape) != (1,):  # LeRobot stores vectors of length one as numbers
         array = array.reshape(n_rows, *feature_shape)
-    # LeRobot goes through Python numbers, so that precision does not survive.
+    # LeRobot converts through Python numbers, so its tensors have the default precision.
     if array.dtype == torch.bool:
         return array
     return array.float() if array.is_floating_point() else array.long()

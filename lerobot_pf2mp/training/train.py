@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""LeRobot's own training function, with low-dimensional datasets held in memory.
+"""LeRobot's own training function, with low-dimensional datasets in memory.
 
 Reading one sample with an action window costs LeRobot's loader about 14 ms, many times the training step of a small
 network. The options, configuration, checkpoints, logs and resumption are those of ``lerobot-train``, and so are the
@@ -30,7 +30,7 @@ def train(limit_gb: float) -> None:
             _in_memory(config, dataset, limit_gb * 1e9) for dataset in make_train_eval_datasets(config)
         )
 
-    # The one place where the training function gets its data; there is no plug-in point for it in LeRobot 0.6.
+    # The training function gets its data only from here. LeRobot 0.6 has no plug-in point for it.
     lerobot_train.make_train_eval_datasets = make_datasets
     lerobot_train.main()
 
@@ -42,7 +42,7 @@ def _in_memory(config: TrainPipelineConfig, dataset: Any, limit_bytes: float) ->
                 "The dataset has images, is streamed or is too large for memory: LeRobot's loader reads it."
             )
         return dataset
-    # Worker processes would only copy what is already there.
+    # Worker processes would only copy the data in memory.
     config.num_workers = 0
     logging.info(f"Keeping {dataset.num_frames} frames in memory.")
     return InMemoryDataset(dataset)

@@ -81,10 +81,8 @@ def _compile(planner: Planner) -> Callable[[], torch.Tensor]:
 
 def _make_multi_task_dit(n_steps: int, device: str) -> Callable[[], torch.Tensor]:
     """Plans one chunk with LeRobot's multi_task_dit, which observes start and goal as one state."""
-    from transformers import (
-        CLIPTextConfig,
-        CLIPTextModel,
-    )  # its defaults are the text encoder that the policy asks for
+    # The defaults of CLIPTextConfig are those of the policy's text encoder.
+    from transformers import CLIPTextConfig, CLIPTextModel
 
     config = MultiTaskDiTConfig(
         device=device,

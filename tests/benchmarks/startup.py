@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the plug-in adds to how long LeRobot takes to start, in fresh processes.
+"""What the plug-in adds to how long LeRobot takes to start, and the maths to how long torch takes, in fresh processes.
 
 ``import lerobot`` alone imports next to nothing, not even torch. To register a policy its configuration must be imported,
 and with it ``lerobot.policies``: torch, diffusers and all of LeRobot's own policies. That is the difference in the first
-case; the second has them on both sides, as has every command of LeRobot that uses a policy.
+case; the second has them on both sides, as has every command of LeRobot that uses a policy. The maths needs neither.
 """
 
 from __future__ import annotations
@@ -17,7 +17,9 @@ from harness import Row, ratio, time_in_turns
 
 N_ROUNDS = 5
 TARGET_SECONDS, TARGET_RATIO = 0.2, 1.05
+MATHS_TARGET_SECONDS = 0.3
 PLUGIN = "lerobot_policy_pf2mp"
+MATHS = "from lerobot_pf2mp import flow_matching, guidance, potential_field"
 POLICIES = "import lerobot.policies, lerobot.envs, lerobot.processor"
 
 # LeRobot imports every installed distribution whose name begins with lerobot_policy_.
@@ -41,12 +43,17 @@ def measure() -> Iterator[Row]:
         "lerobot and plug-in": "import lerobot, lerobot_pf2mp",
         "policies": POLICIES,
         "policies and plug-in": f"{POLICIES}, lerobot_pf2mp",
+        "torch": "import torch",
+        "torch and maths": f"import torch; {MATHS}",
     }
     times = _time(imports)
     for bare, case in (("lerobot", "import lerobot"), ("policies", POLICIES)):
         yield Row("startup", case, "takes", median(times[bare]), "s")
         added = [one - other for one, other in zip(times[f"{bare} and plug-in"], times[bare], strict=True)]
         yield Row("startup", case, "import lerobot_pf2mp adds", median(added), "s", target=TARGET_SECONDS)
+    added = [one - other for one, other in zip(times["torch and maths"], times["torch"], strict=True)]
+    yield Row("startup", "import torch", "takes", median(times["torch"]), "s")
+    yield Row("startup", "import torch", "the maths adds", median(added), "s", target=MATHS_TARGET_SECONDS)
     hidden, shown = "without the plug-in", "with the plug-in"
     times = _time({hidden: _HELP.format(hidden=[PLUGIN]), shown: _HELP.format(hidden=[])})
     for name, seconds in times.items():

@@ -11,7 +11,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot_pf2mp.envs.box import Box
 from lerobot_pf2mp.envs.configs.collision_env import CollisionEnvConfig
 from lerobot_pf2mp.envs.fetch.fetch_scene import FETCH_FPS, check_inner_steps, make_scene
-from lerobot_pf2mp.envs.image_size import picture_size_of
+from lerobot_pf2mp.envs.image_size import image_size_of
 from lerobot_pf2mp.envs.tasks import FETCH_STEPS, FETCH_TASKS
 from lerobot_pf2mp.errors import ConfigError, reported_on_the_command_line
 
@@ -58,7 +58,7 @@ class PF2MPFetchEnv(CollisionEnvConfig):
         with reported_on_the_command_line():
             check_inner_steps(self.n_inner_steps)
             scene = make_scene(FETCH_TASKS[self.task], **self._scene_changes)
-            self._describe(3, 6 if scene.has_block else 3, lambda: picture_size_of(self.render_size))
+            self._describe(3, 6 if scene.has_block else 3, lambda: image_size_of(self.render_size))
         self.fps = round(FETCH_FPS / self.n_inner_steps)
 
     @property

@@ -10,7 +10,7 @@ from lerobot.envs.configs import EnvConfig
 
 from lerobot_pf2mp.envs.configs.collision_env import CollisionEnvConfig
 from lerobot_pf2mp.envs.handwriting.sheet import HANDWRITING_FPS, LETTER_HEIGHT, N_REGIONS, REGION_GAP
-from lerobot_pf2mp.envs.image_size import picture_size_of
+from lerobot_pf2mp.envs.image_size import image_size_of
 from lerobot_pf2mp.envs.tasks import HANDWRITING_STEPS, HANDWRITING_TASKS
 from lerobot_pf2mp.errors import ConfigError, reported_on_the_command_line
 
@@ -60,7 +60,7 @@ class PF2MPHandwritingEnv(CollisionEnvConfig):
         with reported_on_the_command_line():
             _ = self.scene
             dim = 9 if HANDWRITING_TASKS[self.task] == "joint" else 2
-            self._describe(dim, 0, lambda: picture_size_of(self.render_size))
+            self._describe(dim, 0, lambda: image_size_of(self.render_size))
 
     @property
     def scene(self) -> WritingScene:

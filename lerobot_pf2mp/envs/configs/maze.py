@@ -51,12 +51,12 @@ class PF2MPMazeEnv(CollisionEnvConfig):
 
     def _image_size(self) -> tuple[int, int]:
         # Imported here because LeRobot imports this file for every command.
-        from lerobot_pf2mp.envs.maze.maze_image import MazePicture
+        from lerobot_pf2mp.envs.maze.maze_image import MazeImage
         from lerobot_pf2mp.envs.maze.point_maze import parse_maze_map
 
         with reported_on_the_command_line():
             maze_map = parse_maze_map(self.maze_map or MAZE_TASKS[str(self.task)])
-            return MazePicture(maze_map, self.render_size).size
+            return MazeImage(maze_map, self.render_size).size
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fetch behind a wall: gymnasium-robotics' Reach and Push with positions as actions and collisions reported."""
+"""Fetch with a wall: gymnasium-robotics' Reach and Push with positions as actions, and with collision reports."""
 
 from __future__ import annotations
 
@@ -22,19 +22,16 @@ from lerobot_pf2mp.envs.fetch.fetch_scene import (
     make_scene,
 )
 from lerobot_pf2mp.envs.headless import rendering
-from lerobot_pf2mp.envs.image_size import picture_size_of
+from lerobot_pf2mp.envs.image_size import image_size_of
 
-# Fetch moves the hand by 0.05 m times its action at most; within one of its steps the hand follows about two thirds of
-# the way. With this gain and steps of at most `MAX_STEP` it stays within 2 mm of where it is sent, 4 mm in a first step.
+# Fetch moves the hand's target by at most 0.05 m times its action. In one step the hand covers about two thirds of that
+# distance. With this gain and steps of at most `MAX_STEP` it stays within 2 mm of the action, 4 mm in the first step.
 _GAIN = 30.0
 MAX_STEP = 0.03  # [m]
 _SETTLED = 0.001  # [m]
 _MAX_SETTLING_STEPS = 60
-_PARKED = (
-    2.0,
-    2.0,
-    0.025,
-)  # the block's place while the gripper moves to its start, on the floor behind the table [m]
+# Position of the block while the gripper moves to its start, on the floor behind the table [m].
+_PARKED = (2.0, 2.0, 0.025)
 _CAMERA = {"lookat": np.array([1.3, 0.75, 0.48]), "distance": 1.35, "azimuth": 150.0, "elevation": -28.0}
 
 
@@ -47,21 +44,22 @@ class FetchEnv(gym.Env):
     500 Hz.
 
     ## Action space
-    ``Box(3)``: the position x, y, z of the gripper [m]. Positions out of reach are moved to the border of the workspace.
+    ``Box(3)``: the position x, y, z of the gripper [m]. Positions outside the workspace are clipped to it.
 
     ## Observation space
     ``Dict``: ``agent_pos`` ``(3,)``, the gripper's position [m], and ``environment_state``, the goal's ``(3,)`` for Reach,
     the block's and the goal's ``(6,)`` for Push [m].
 
     ## Rewards
-    -1.0 on the first step in collision of an episode, 0.0 otherwise; the sum over an episode is minus its collision.
+    -1.0 on the first step with a collision in an episode, 0.0 otherwise. So the return of an episode is -1 with a collision
+    and 0 without.
 
     ## Information
     ``is_success``: gripper (Reach) or block (Push) is within 0.05 m of the goal. ``is_collision``: a link of the robot, or
     the block, has touched the wall in this episode, in any physics step. ``clearance``: the smallest distance from the
     wall to robot and block [m], negative inside it. ``is_plan_in_wall``: an action of this episode lay inside the wall,
     the measure of earlier work (Wang et al., Cold Diffusion on the Replay Buffer, 2023). ``path_length``: the length of
-    the gripper's way in this episode [m].
+    the gripper's executed path in this episode [m].
 
     ## Starting state
     Drawn from the ranges of the scene. ``reset(options={"start": (x, y, z), "goal": (x, y, z), "block": (x, y)})`` sets
@@ -72,15 +70,16 @@ class FetchEnv(gym.Env):
 
     Args:
         task: ``reach`` or ``push``.
-        wall_position: x, y of the wall's centre [m]. None, as for all of the following: that of `fetch_scene.FETCH_SCENES`.
+        wall_position: x, y of the wall's centre [m]. For this and the next four, None means the value of the task in
+            `fetch_scene.FETCH_SCENES`.
         wall_size: Its sides [m]; it stands on the table.
-        start_range: Two opposite corners of where the gripper starts [m].
-        goal_range: The same of the goal [m]; for Push x and y only.
-        block_range: The same of the block, x and y [m].
+        start_range: Two opposite corners of the box of start positions of the gripper [m].
+        goal_range: The same for the goal [m]; for Push x and y only.
+        block_range: The same for the block, x and y [m]; for Push only.
         n_inner_steps: Steps of the inner loop for each action, 0.04 s each.
         terminate_on_success: Whether an episode ends at the goal.
         render_mode: ``rgb_array`` or None.
-        render_size: Width of the picture [pixels]; its height is three quarters of that.
+        render_size: Width of the image [pixels]; its height is three quarters of that.
 
     Raises:
         ValueError: If an argument breaks its rule.
@@ -106,7 +105,7 @@ class FetchEnv(gym.Env):
             raise ValueError(
                 f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}"
             )
-        height, width = picture_size_of(render_size)
+        height, width = image_size_of(render_size)
         self.scene = make_scene(
             task,
             wall_position=wall_position,
@@ -155,14 +154,15 @@ class FetchEnv(gym.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Starts an episode; see the class for the options.
+        """Starts an episode. The options are described in the class docstring.
 
         Raises:
-            ValueError: If a place asked for is out of reach or touches the wall, or the block cannot be pushed straight.
+            ValueError: If a position in `options` is outside the workspace or touches the wall, or the block cannot be
+                pushed to the goal in a straight line.
         """
         super().reset(seed=seed)
-        places = {name: (options or {}).get(name) for name in ("start", "goal", "block")}
-        layout = self.scene.sample(self.np_random, **places)
+        positions = {name: (options or {}).get(name) for name in ("start", "goal", "block")}
+        layout = self.scene.sample(self.np_random, **positions)
         self._fetch.reset()
         self._fetch.goal = self._goal = layout.goal
         with self._fetch.obstacle.passable():
@@ -178,7 +178,7 @@ class FetchEnv(gym.Env):
         return self._observation(), self._info(self._fetch.obstacle.clearance())
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
-        """Moves the gripper towards ``(3,)`` a position [m].
+        """Moves the gripper towards a position ``(3,)`` [m].
 
         Raises:
             ValueError: If the action is not three finite coordinates.
@@ -202,23 +202,23 @@ class FetchEnv(gym.Env):
         return self._observation(), -1.0 if is_first else 0.0, terminated, False, info
 
     def render(self) -> np.ndarray | None:
-        """A picture ``(H, W, 3)`` uint8 of robot, wall, block and goal.
+        """An image ``(H, W, 3)`` uint8 of robot, wall, block and goal.
 
         Raises:
-            RuntimeError: If this machine cannot render; says what to install.
+            RuntimeError: If this machine cannot render; the message says what to install.
         """
         if self.render_mode is None:
             return None
         if not self._is_running:
             raise gym.error.ResetNeeded("call reset() before render()")
         with rendering():
-            picture = self._fetch.render()
+            image = self._fetch.render()
         if not self._has_rendered:
-            # The renderer of an environment that nobody closes would complain when Python ends. Registered only now, as
-            # MuJoCo registers the end of OpenGL when it begins, and what is registered last is called first.
+            # Without this, the renderer of an environment that is not closed prints an error when Python exits. It is
+            # registered after the first rendering: then it is called before the exit handler of MuJoCo, which ends OpenGL.
             atexit.register(_close, weakref.ref(self._fetch))
             self._has_rendered = True
-        return picture
+        return image
 
     def close(self) -> None:
         """Frees the simulation."""
@@ -231,7 +231,11 @@ class FetchEnv(gym.Env):
                 return
 
     def _move(self, target: np.ndarray) -> float:
-        """One step of Fetch towards the target; how deep robot or block were in the wall, at most 0 if they were not."""
+        """Takes one step of Fetch towards the target.
+
+        Returns:
+            The largest depth of the robot or the block in the wall during the step [m]; at most 0 without contact.
+        """
         fetch = self._fetch
         displacement = ((target - self._grip) * _GAIN).clip(-1, 1)
         fetch._set_action(np.array([*displacement, 0.0]))
@@ -240,7 +244,7 @@ class FetchEnv(gym.Env):
             mujoco.mj_step(fetch.model, fetch.data)
             depth = max(depth, fetch.obstacle.contact_depth())
         fetch._step_callback()
-        # A physics step looks for contacts before it moves; the callback has looked again.
+        # A physics step detects contacts before it moves; the callback has detected them again.
         return max(depth, fetch.obstacle.contact_depth())
 
     def _place_block(self, position: np.ndarray | tuple[float, float, float]) -> None:
@@ -249,10 +253,10 @@ class FetchEnv(gym.Env):
         joint.qvel[:] = 0.0
 
     def _observation(self) -> dict[str, np.ndarray]:
-        places = [self._goal] if self._block is None else [self._block, self._goal]
+        positions = [self._goal] if self._block is None else [self._block, self._goal]
         return {
             "agent_pos": self._grip.astype(np.float32),
-            "environment_state": np.concatenate(places).astype(np.float32),
+            "environment_state": np.concatenate(positions).astype(np.float32),
         }
 
     def _info(self, clearance: float) -> dict[str, Any]:

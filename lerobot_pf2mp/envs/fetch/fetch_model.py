@@ -13,7 +13,7 @@ import numpy as np
 from lerobot_pf2mp.envs.box import Box
 from lerobot_pf2mp.envs.obstacle import Obstacle
 
-with contextlib.redirect_stderr(io.StringIO()):  # at every import a notice about quite other environments
+with contextlib.redirect_stderr(io.StringIO()):  # the import prints a notice about other environments
     from gymnasium_robotics.envs.fetch.fetch_env import MujocoFetchEnv
     from gymnasium_robotics.envs.fetch.push import MujocoFetchPushEnv
     from gymnasium_robotics.envs.fetch.reach import MujocoFetchReachEnv
@@ -27,7 +27,7 @@ class _WithWall(MujocoFetchEnv):
 
     Args:
         wall: The wall [m].
-        **options: For the environment.
+        **options: Arguments of the environment.
     """
 
     initial_qpos: Any
@@ -46,8 +46,8 @@ class _WithWall(MujocoFetchEnv):
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         self.obstacle = Obstacle(self.model, self.data, WALL, _movers(self.model))
-        # From here on as the method of the same name in gymnasium-robotics, which loads the model from a file. The
-        # robot's first posture has the gripper where the wall stands.
+        # The rest is copied from the method of the same name in gymnasium-robotics, which loads the model from a file.
+        # The wall lets the robot pass, because the gripper is inside the wall in the robot's first posture.
         self._model_names = self._utils.MujocoModelNames(self.model)
         self.model.vis.global_.offwidth = self.width
         self.model.vis.global_.offheight = self.height
@@ -67,12 +67,12 @@ class _Push(_WithWall, MujocoFetchPushEnv):
 
 
 def make_fetch(wall: Box, has_block: bool, **options: Any) -> _WithWall:
-    """Fetch with a wall, whose contacts its `obstacle` reports.
+    """Makes a Fetch environment with a wall. Its `obstacle` reports contacts with the wall.
 
     Args:
         wall: The wall [m].
-        has_block: FetchPush rather than FetchReach.
-        **options: For the environment, for example ``width``.
+        has_block: Whether to make FetchPush, not FetchReach.
+        **options: Arguments of the environment, for example ``width``.
     """
     return (_Push if has_block else _Reach)(wall, **options)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where things are in the Fetch tasks: the wall, and where the gripper, the block and the goal may be placed."""
+"""The scenes of the Fetch tasks: the wall, and the ranges of positions of the gripper, the block and the goal."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ import numpy as np
 from lerobot_pf2mp.envs.box import Box
 
 TABLE = Box.between((1.05, 0.40, 0.0), (1.55, 1.10, 0.40))
-# Where the gripper is moved to; measured: it reaches every corner within 1 cm.
+# Limits of the gripper's position. Measured: the gripper reaches every corner within 1 cm.
 WORKSPACE = Box.between((1.05, 0.45, 0.415), (1.55, 1.05, 0.80))
 # The hand and the closed fingers around the gripper's position (the site robot0:grip); measured in the model.
 HAND = Box.between((-0.040, -0.063, 0.052), (0.040, 0.063, 0.174))
 FINGERS = Box.between((-0.014, -0.015, -0.019), (0.014, 0.015, 0.059))
 BLOCK_SIZE = 0.05  # [m]
-BLOCK_HEIGHT = 0.425  # of the block's centre on the table [m]
+BLOCK_HEIGHT = 0.425  # z of the block's centre on the table [m]
 
-FETCH_FPS = 25  # [Hz], of gymnasium-robotics' Fetch
+FETCH_FPS = 25  # [Hz], gymnasium-robotics' own
 SUCCESS_RADIUS = 0.05  # [m], gymnasium-robotics' own
-_MARGIN = 0.01  # between the hand and the wall where something is placed [m]
-_MIN_PUSH = 0.1  # [m]
-_MAX_WALL_TOP = 0.72  # so that the gripper can pass above [m]
+_MARGIN = 0.01  # smallest distance of sampled positions of the hand to the wall [m]
+_MIN_PUSH = 0.1  # smallest distance from the block to the goal [m]
+_MAX_WALL_TOP = 0.72  # above a higher wall the gripper could not pass [m]
 _N_TRIES = 1000
 _TINY = 1e-9
 
@@ -35,12 +35,12 @@ Corners = tuple[tuple[float, ...], tuple[float, ...]]
 
 @dataclass(frozen=True)
 class Layout:
-    """One episode's places.
+    """The positions of one episode.
 
     Args:
-        start: ``(3,)`` the gripper's [m].
-        goal: ``(3,)`` where the gripper, or the block, is to go [m].
-        block: ``(3,)`` the block's centre [m]; None without a block.
+        start: ``(3,)`` start of the gripper [m].
+        goal: ``(3,)`` goal of the gripper, or of the block [m].
+        block: ``(3,)`` centre of the block [m]; None without a block.
     """
 
     start: np.ndarray
@@ -50,19 +50,20 @@ class Layout:
 
 @dataclass(frozen=True)
 class FetchScene:
-    """A wall on Fetch's table and the ranges that starts, goals and blocks are drawn from, evenly.
+    """A wall on Fetch's table, and the ranges from which starts, goals and blocks are drawn uniformly.
 
     The table's top is at z = 0.40 m, x in 1.05 to 1.55 m (away from the robot), y in 0.40 to 1.10 m (to its left).
 
     Args:
         wall_position: x, y of the wall's centre [m]; it stands on the table.
         wall_size: The wall's sides [m].
-        start_range: Two opposite corners of where the gripper starts [m].
-        goal_range: The same of the goal [m]; with a block x and y only, as goals lie on the table.
-        block_range: The same of the block, x and y [m]; None without a block.
+        start_range: Two opposite corners of the box of start positions of the gripper [m].
+        goal_range: The same for the goal [m]; with a block x and y only, because goals then lie on the table.
+        block_range: The same for the block, x and y [m]; None without a block.
 
     Raises:
-        ValueError: If the wall leaves no way above it, or a range leaves no place that is clear of the wall and in reach.
+        ValueError: If the gripper cannot pass above the wall, or a range has no position that is in the workspace and clear
+            of the wall.
     """
 
     wall_position: tuple[float, float]
@@ -116,31 +117,31 @@ class FetchScene:
         goal: Sequence[float] | np.ndarray | None = None,
         block: Sequence[float] | np.ndarray | None = None,
     ) -> Layout:
-        """Draws an episode's places.
+        """Draws the positions of an episode.
 
         Args:
             rng: Source of randomness.
-            start: ``(3,)`` the gripper's [m]; None, as for the others, to draw it.
-            goal: ``(3,)`` the goal's [m].
-            block: ``(3,)`` the block's centre [m]; without z on the table.
+            start: ``(3,)`` start of the gripper [m]. For this and the next two, None draws it.
+            goal: ``(3,)`` the goal [m].
+            block: ``(3,)`` centre of the block [m], or ``(2,)`` x and y on the table.
 
         Raises:
-            ValueError: If a place is out of reach, or no layout is found that is clear of the wall.
+            ValueError: If a position is outside the workspace, or no layout is found that is clear of the wall.
         """
         if block is not None and not self.has_block:
             raise ValueError(f"block is for push only, got {block}")
         lies_on_table = {"start": False, "goal": self.has_block, "block": True}
         given = {
-            name: _check_place(name, place, lies_on_table[name])
-            for name, place in (("start", start), ("goal", goal), ("block", block))
-            if place is not None
+            name: _check_position(name, position, lies_on_table[name])
+            for name, position in (("start", start), ("goal", goal), ("block", block))
+            if position is not None
         }
         for _ in range(_N_TRIES):
-            places = {"start": rng.uniform(*self.start_range), "goal": rng.uniform(*self.goal_range)}
+            positions = {"start": rng.uniform(*self.start_range), "goal": rng.uniform(*self.goal_range)}
             if self.block_range is not None:
-                places["goal"] = np.array([*places["goal"], BLOCK_HEIGHT])
-                places["block"] = np.array([*rng.uniform(*self.block_range), BLOCK_HEIGHT])
-            layout = Layout(**{**places, **given})
+                positions["goal"] = np.array([*positions["goal"], BLOCK_HEIGHT])
+                positions["block"] = np.array([*rng.uniform(*self.block_range), BLOCK_HEIGHT])
+            layout = Layout(**{**positions, **given})
             if self.fits(layout):
                 return layout
         if given:
@@ -149,8 +150,8 @@ class FetchScene:
                 f"goal of at least {_MIN_PUSH} m; none found with { ({k: v.tolist() for k, v in given.items()}) }"
             )
         raise ValueError(
-            f"start, goal and block ranges must leave places clear of the wall, and ways to push along; none found in "
-            f"{_N_TRIES} tries with the wall at {self.wall_position} of size {self.wall_size}"
+            f"start, goal and block ranges must leave positions clear of the wall, and free lines to push along; none "
+            f"found in {_N_TRIES} tries with the wall at {self.wall_position} of size {self.wall_size}"
         )
 
     def fits(self, layout: Layout) -> bool:
@@ -163,29 +164,29 @@ class FetchScene:
         length = math.hypot(*push)
         if length < _MIN_PUSH or math.dist(layout.start[:2], layout.block[:2]) < _MIN_PUSH:
             return False
-        # The gripper begins a fingers' and half a block's width behind.
+        # The gripper starts to push from behind the block, at two block sizes from its centre.
         behind = layout.block - push / length * 2 * BLOCK_SIZE
         if np.any(behind[:2] < WORKSPACE.low[:2]) or np.any(behind[:2] > WORKSPACE.high[:2]):
             return False
-        reach = BLOCK_SIZE / math.sqrt(2) + _MARGIN  # of the block, however it turns
-        pushed = Box((0, 0, 0), (2 * reach, 2 * reach, BLOCK_SIZE))
+        radius = BLOCK_SIZE / math.sqrt(2) + _MARGIN  # for every rotation of the block
+        pushed = Box((0, 0, 0), (2 * radius, 2 * radius, BLOCK_SIZE))
         return not (
             self.hits_wall(behind, layout.goal, _MARGIN)
             or self.wall.grown_by(pushed).blocks(layout.block, layout.goal)
         )
 
     def is_blocked(self, layout: Layout) -> bool:
-        """Whether the gripper hits the wall on the straight way to the goal, with a block by way of the block."""
+        """Whether the gripper hits the wall on the straight path to the goal; with a block, on the path via the block."""
         stations = [layout.start, *([] if layout.block is None else [layout.block]), layout.goal]
         return any(self.hits_wall(a, b) for a, b in itertools.pairwise(stations))
 
     def hits_wall(self, start: np.ndarray, end: np.ndarray, margin: float = 0.0) -> bool:
-        """Whether hand or fingers touch the wall when the gripper moves straight from one place to another.
+        """Whether hand or fingers touch the wall when the gripper moves straight from one position to another.
 
         Args:
-            start: ``(3,)`` [m].
-            end: ``(3,)`` [m].
-            margin: How far they must stay away [m].
+            start: ``(3,)`` first position of the gripper [m].
+            end: ``(3,)`` last position [m].
+            margin: Distance to the wall below which they count as touching it [m].
         """
         spread = Box((0, 0, 0), (2 * margin,) * 3)
         return any(self.wall.grown_by(part).grown_by(spread).blocks(start, end) for part in (HAND, FINGERS))
@@ -206,15 +207,15 @@ def _check_range(name: str, corners: Corners, n_coordinates: int) -> None:
         raise ValueError(
             f"{name} must be two corners of {n_coordinates} coordinates each [m], the smaller ones first, got {corners}"
         )
-    reach = WORKSPACE.low[:n_coordinates], WORKSPACE.high[:n_coordinates]
-    if np.any(low < reach[0]) or np.any(high > reach[1]):
+    lowest, highest = WORKSPACE.low[:n_coordinates], WORKSPACE.high[:n_coordinates]
+    if np.any(low < lowest) or np.any(high > highest):
         raise ValueError(
-            f"{name} must be in the gripper's reach, from {reach[0].tolist()} to {reach[1].tolist()} m, got {corners}"
+            f"{name} must be in the gripper's workspace, from {lowest.tolist()} to {highest.tolist()} m, got {corners}"
         )
 
 
-def _check_place(name: str, place: Sequence[float] | np.ndarray, lies_on_table: bool) -> np.ndarray:
-    position = np.asarray(place, dtype=float)
+def _check_position(name: str, given: Sequence[float] | np.ndarray, lies_on_table: bool) -> np.ndarray:
+    position = np.asarray(given, dtype=float)
     if lies_on_table and position.shape == (2,):
         position = np.array([*position, BLOCK_HEIGHT])
     is_reachable = position.shape == (3,) and bool(
@@ -223,17 +224,17 @@ def _check_place(name: str, place: Sequence[float] | np.ndarray, lies_on_table: 
     if not is_reachable or (lies_on_table and abs(position[2] - BLOCK_HEIGHT) > 1e-3):
         height = f", z = {BLOCK_HEIGHT} on the table" if lies_on_table else ""
         raise ValueError(
-            f"{name} must be a place x, y, z in the gripper's reach, from {WORKSPACE.low.round(3).tolist()} to "
-            f"{WORKSPACE.high.round(3).tolist()} m{height}, got {place}"
+            f"{name} must be a position x, y, z in the gripper's workspace, from {WORKSPACE.low.round(3).tolist()} to "
+            f"{WORKSPACE.high.round(3).tolist()} m{height}, got {given}"
         )
     return position
 
 
 def check_inner_steps(n_inner_steps: int) -> None:
-    """Whether an action can have so many steps of the inner loop.
+    """Checks the number of steps of the inner loop for each action.
 
     Raises:
-        ValueError: If not.
+        ValueError: If it is not a whole number from 1 to `FETCH_FPS`.
     """
     if not isinstance(n_inner_steps, int) or not 1 <= n_inner_steps <= FETCH_FPS:
         raise ValueError(f"n_inner_steps must be a whole number from 1 to {FETCH_FPS}, got {n_inner_steps}")
@@ -257,10 +258,14 @@ FETCH_SCENES = {
 
 
 def make_scene(task: str, **changes: Any) -> FetchScene:
-    """The scene of a task, with changes to its arguments; those that are None stay as they are.
+    """Makes the scene of a task.
+
+    Args:
+        task: A key of `FETCH_SCENES`.
+        **changes: Arguments of `FetchScene` that replace those of the task; None keeps the value of the task.
 
     Raises:
-        ValueError: If there is no such task, or the scene does not work.
+        ValueError: If there is no such task, or the changed scene breaks a rule of `FetchScene`.
     """
     if task not in FETCH_SCENES:
         raise ValueError(f"task must be one of {list(FETCH_SCENES)}, got {task!r}")

@@ -24,14 +24,14 @@ from lerobot_pf2mp.envs.handwriting.sheet import (
 )
 from lerobot_pf2mp.envs.handwriting.sheet_image import draw_sheet
 from lerobot_pf2mp.envs.handwriting.writing_scene import SHEET_CORNERS, check_on_sheet, make_writing_scene
-from lerobot_pf2mp.envs.image_size import picture_size_of
+from lerobot_pf2mp.envs.image_size import image_size_of
 from lerobot_pf2mp.envs.obstacle import Obstacle
 
 SPACES = ("joint", "pen")
 CONTROLS = ("physics", "exact")
-START_SPREAD = 0.005  # how far from the stroke's beginning the pen starts at most, on both axes [m]
+START_SPREAD = 0.005  # largest distance between the pen's start and the stroke's beginning, on each axis [m]
 
-_LARGEST_SWEEP = 0.02  # of a joint between two looks for contact [rad]
+_LARGEST_SWEEP = 0.02  # largest motion of a joint between two checks for contact [rad]
 _MAX_SWEEPS = 200
 _STEPS_BETWEEN_TIPS = 5  # physics steps
 
@@ -41,47 +41,49 @@ class HandwritingEnv(gym.Env):
 
     ## Description
     The Franka Panda of gymnasium-robotics holds a pen over a white table, as in Sections V-D and V-E of the paper. The
-    letter, grey, and the regions, red, are on a sheet in front of it. The pen draws wherever its tip is at most 7 mm
-    above the table. The frame is that of the arm's base: x forward, y to its left [m].
+    letter, grey, and the regions, red, are on a sheet in front of it. The pen draws where its tip is at most 7 mm above
+    the table. The frame is that of the arm's base: x forward, y to its left [m].
 
     ## Action space
     ``space="joint"``: ``Box(9)``, the next positions of the seven joints [rad] and the two fingers [m]. ``space="pen"``:
-    ``Box(2)``, the next place x, y of the pen's tip [m], which inverse kinematics turns into joint positions with the pen
-    upright on the table. Values beyond the limits are moved to them.
+    ``Box(2)``, the next position x, y of the pen's tip [m], which inverse kinematics turns into joint positions with the
+    pen upright on the table. Values outside the limits are clipped to them.
 
     ## Observation space
     ``Dict``: ``agent_pos``, the positions of the joints and fingers ``(9,)``, or of the pen's tip ``(2,)``, measured.
 
     ## Rewards
-    -1.0 on the first step in collision of an episode, 0.0 otherwise; the sum over an episode is minus its collision.
+    -1.0 on the first step with a collision in an episode, 0.0 otherwise. So the return of an episode is -1 with a collision
+    and 0 without.
 
     ## Information
-    ``is_success``: every place of the letter is within 0.015 m of what has been drawn, whose mean distance to the letter is
-    below 0.01 m. ``is_collision``: in this episode what was drawn has entered a region, or the arm or the pen's barrel has
-    touched the table. ``clearance``: the smallest distance on the way of this step between pen and regions, or between arm
-    and table [m], negative inside. ``stroke_error``: mean distance of what has been drawn to the letter [m].
-    ``path_length``: length of what has been drawn [m].
+    ``is_success``: every point of the letter is within 0.015 m of the drawn line, and the mean distance of the drawn line to
+    the letter is at most 0.01 m. ``is_collision``: in this episode the drawn line has entered a region, or the arm or the
+    pen's barrel has touched the table. ``clearance``: the smallest distance during this step between pen and regions, or
+    between arm and table [m], negative inside. ``stroke_error``: mean distance of the drawn line to the letter [m].
+    ``path_length``: length of the drawn line [m].
 
     ## Starting state
-    The pen on the table, up to 5 mm off the beginning of the letter on both axes, the arm at rest. ``reset(options=
-    {"start": (x, y)})`` sets its place [m], ``reset(options={"joints": (9 positions)})`` the joints' [rad; m].
+    The pen on the table, up to 5 mm from the beginning of the letter on each axis, the arm at rest. ``reset(options=
+    {"start": (x, y)})`` sets the pen's position [m], ``reset(options={"joints": (9 positions)})`` the joints' [rad; m].
 
     ## Episode end
     After the registered number of steps. Neither a collision nor success ends it.
 
     Args:
-        space: What observations and actions are, joint or pen.
+        space: ``joint``, observations and actions are joint positions; or ``pen``, they are positions of the pen's tip.
         letter: One of `letters.LETTERS`.
-        letter_height: [m].
-        region_gap: Between the letter and the restricted regions [m].
-        n_regions: How many regions are put into the letter's bays.
-        scene_file: A JSON file with a stroke and regions of your own instead, see `writing_scene.read_writing_scene`.
-        control: ``physics``, position controllers with gravity compensation drive the arm, 500 Hz; or ``exact``, the arm
-            reaches every action. In both the way between two actions is swept for collisions.
+        letter_height: Height of the letter [m].
+        region_gap: Distance between the letter and the restricted regions [m].
+        n_regions: Largest number of regions in the concave parts of the letter.
+        scene_file: A JSON file with your own stroke and regions instead of a letter, see
+            `writing_scene.read_writing_scene`.
+        control: ``physics``: position controllers with gravity compensation drive the arm, 500 Hz. ``exact``: the arm
+            reaches every action. With both, the path between two actions is checked for collisions.
         fps: Control frequency [Hz], a divisor of the physics' 500 Hz.
         render_mode: ``rgb_array`` or None.
-        render_size: Width of the picture [pixels]; its height is three quarters of that.
-        camera: arm, from the side, or top, of the sheet.
+        render_size: Width of the image [pixels]; its height is three quarters of that.
+        camera: ``arm``, a view of the arm from the side; or ``top``, a view of the sheet from above.
 
     Raises:
         ValueError: If an argument breaks its rule.
@@ -122,17 +124,17 @@ class HandwritingEnv(gym.Env):
         self.task = f"handwriting-{space}"
         self.task_description = f"Write {self.scene.name} without entering a red region."
         self._space, self._control = space, control
-        picture_size = picture_size_of(render_size)
-        self._model = make_panda(draw_sheet(self.scene), picture_size)
+        image_size = image_size_of(render_size)
+        self._model = make_panda(draw_sheet(self.scene), image_size)
         self._data = mujoco.MjData(self._model)
-        self._camera = PandaCamera(self._model, camera, picture_size)
+        self._camera = PandaCamera(self._model, camera, image_size)
         self._table = Obstacle(self._model, self._data, TABLE, _movers(self._model))
         self._tip = self._data.site(PEN_TIP).xpos  # a view
         self.kinematics = PenKinematics(self._model)
         self._n_substeps = _substeps(fps, self._model.opt.timestep)
         self.metadata = {**self.metadata, "render_fps": fps}
         self.action_space: spaces.Box = _action_space(space, self._model)
-        # In full physics a joint may be pressed a little beyond its limit, and the pen off the sheet.
+        # In full physics a joint may be pressed a little beyond its limit, and the pen may leave the sheet.
         self.observation_space = spaces.Dict(
             {"agent_pos": spaces.Box(-np.inf, np.inf, self.action_space.shape, dtype=np.float32)}
         )
@@ -143,10 +145,10 @@ class HandwritingEnv(gym.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Starts an episode; see the class for the options.
+        """Starts an episode. The options are described in the class docstring.
 
         Raises:
-            ValueError: If the start asked for is not on the sheet, or the joints are beyond their limits.
+            ValueError: If the start in `options` is not on the sheet, or the joints in it are beyond their limits.
         """
         super().reset(seed=seed)
         self._target = self._first_joints(options or {})
@@ -159,7 +161,9 @@ class HandwritingEnv(gym.Env):
         return self._observation(), self._info(min(clearance, self._table.clearance()))
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
-        """Moves the arm to, or towards, ``(9,)`` joint positions [rad; m] or ``(2,)`` a place of the pen [m].
+        """Moves the arm to joint positions ``(9,)`` [rad; m], or to a position ``(2,)`` of the pen [m].
+
+        With ``control="physics"`` it moves towards them.
 
         Raises:
             ValueError: If the action has another shape or is not finite.
@@ -184,16 +188,16 @@ class HandwritingEnv(gym.Env):
         return self._observation(), -1.0 if is_first else 0.0, False, False, info
 
     def render(self) -> np.ndarray | None:
-        """A picture ``(H, W, 3)`` uint8 of the arm, the sheet and what has been drawn.
+        """An image ``(H, W, 3)`` uint8 of the arm, the sheet and the drawn line.
 
         Raises:
-            RuntimeError: If this machine cannot render; says what to install.
+            RuntimeError: If this machine cannot render; the message says what to install.
         """
         if self.render_mode is None:
             return None
         if not self._is_running:
             raise gym.error.ResetNeeded("call reset() before render()")
-        return self._camera.picture(self._data, self.ink)
+        return self._camera.render(self._data, self.ink)
 
     @property
     def pen(self) -> np.ndarray:
@@ -225,12 +229,16 @@ class HandwritingEnv(gym.Env):
             start = start.clip(*SHEET_CORNERS)
         start = np.asarray(start, dtype=np.float64)
         if start.shape != (2,):
-            raise ValueError(f"start must be finite places x, y [m], got {start.tolist()}")
+            raise ValueError(f"start must be finite positions x, y [m], got {start.tolist()}")
         check_on_sheet(start, "start")
         return self.kinematics.joints(start)
 
     def _move_exactly(self, target: np.ndarray) -> tuple[np.ndarray, float]:
-        """The tip's positions ``(N, 3)`` on the way, and the smallest distance of the arm to the table [m]."""
+        """Moves the arm exactly to the target.
+
+        Returns:
+            ``(N, 3)`` the positions of the tip during the motion [m], and the smallest distance of the arm to the table [m].
+        """
         start = self._data.qpos.copy()
         n = int(np.clip(math.ceil(np.abs(target - start).max() / _LARGEST_SWEEP), 1, _MAX_SWEEPS))
         tips, clearance = [self._tip.copy()], math.inf
@@ -242,7 +250,11 @@ class HandwritingEnv(gym.Env):
         return np.array(tips), clearance
 
     def _drive(self, target: np.ndarray) -> tuple[np.ndarray, float]:
-        """The same in full physics, while the controllers' set points move evenly to the target."""
+        """Drives the arm to the target in full physics; the set points of the controllers move there at constant speed.
+
+        Returns:
+            The same as `_move_exactly`.
+        """
         before = self._target
         tips, clearance = [self._tip.copy()], math.inf
         for substep in range(1, self._n_substeps + 1):
@@ -253,7 +265,7 @@ class HandwritingEnv(gym.Env):
                 clearance = min(clearance, self._table_clearance())
             elif self._table.contact_depth() > 0:
                 clearance = min(clearance, -self._table.contact_depth())
-        # A physics step looks for contacts, and where the pen is, before it moves.
+        # A physics step updates contacts and the position of the pen before it moves.
         mujoco.mj_fwdPosition(self._model, self._data)
         tips.append(self._tip.copy())
         return np.array(tips), min(clearance, self._table_clearance())

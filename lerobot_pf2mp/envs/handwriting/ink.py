@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the pen has drawn, compared with the letter."""
+"""The line that the pen has drawn, compared with the letter."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from lerobot_pf2mp.envs.handwriting.stroke import distances, evenly_spaced, line
 from lerobot_pf2mp.envs.handwriting.writing_scene import WritingScene
 
 INK_HEIGHT = 0.007  # height of the tip up to which the pen draws [m]
-COVERED = 0.015  # distance of the letter to the ink within which it counts as drawn [m]
+COVERED = 0.015  # a point of the letter counts as drawn if the ink is at most this far away [m]
 LARGEST_ERROR = 0.01  # mean distance of the ink to the letter [m]
 
-_SPACING = 0.001  # of the ink's places whose distance is taken [m]
+_SPACING = 0.001  # between the points of the ink at which its distance to the letter is measured [m]
 
 
 class Ink:
@@ -26,20 +26,20 @@ class Ink:
 
     def __init__(self, scene: WritingScene) -> None:
         self._scene = scene
-        self.strokes: list[np.ndarray] = []  # each (N, 2) places [m]
-        self.length = 0.0  # of all strokes [m]
+        self.strokes: list[np.ndarray] = []  # each (N, 2) positions [m]
+        self.length = 0.0  # total length of all strokes [m]
         self._is_covered = np.zeros(len(scene.stroke), dtype=bool)
-        self._integral = 0.0  # of the ink's distance to the letter over its length [m^2]
+        self._integral = 0.0  # distance of the ink to the letter, integrated over the ink's length [m^2]
         self._is_down = False
 
     def draw(self, tips: np.ndarray) -> float:
-        """Draws where the pen is on the table.
+        """Draws the parts of a trajectory where the pen is on the table.
 
         Args:
-            tips: ``(N, 3)`` positions of the pen's tip, one after the other, from the last one of the call before [m].
+            tips: ``(N, 3)`` positions of the pen's tip in order of time [m]. The first is the last of the previous call.
 
         Returns:
-            Smallest distance of what was drawn now to a region [m], negative inside; inf if nothing was drawn.
+            Smallest distance of the newly drawn line to a region [m], negative inside; inf if nothing was drawn.
         """
         is_down = tips[:, 2] <= INK_HEIGHT
         clearance = math.inf
@@ -57,18 +57,18 @@ class Ink:
 
     @property
     def is_success(self) -> bool:
-        """Whether the whole letter is covered, and the ink near it."""
+        """Whether the whole letter is covered and the ink is near it."""
         return bool(self._is_covered.all()) and self.error <= LARGEST_ERROR
 
-    def _draw_part(self, places: np.ndarray, goes_on: bool) -> float:
+    def _draw_part(self, positions: np.ndarray, goes_on: bool) -> float:
         if goes_on:
-            self.strokes[-1] = np.concatenate([self.strokes[-1], places[1:]])
+            self.strokes[-1] = np.concatenate([self.strokes[-1], positions[1:]])
         else:
-            self.strokes.append(places)
-        line = line_of(places)
+            self.strokes.append(positions)
+        line = line_of(positions)
         self.length += line.length
-        self._is_covered |= distances(self._scene.stroke, places) <= COVERED
-        errors = distances(evenly_spaced(places, _SPACING)[1:], self._scene.stroke)
+        self._is_covered |= distances(self._scene.stroke, positions) <= COVERED
+        errors = distances(evenly_spaced(positions, _SPACING)[1:], self._scene.stroke)
         if len(errors):
             self._integral += float(errors.mean()) * line.length
-        return self._scene.clearance(places)
+        return self._scene.clearance(positions)

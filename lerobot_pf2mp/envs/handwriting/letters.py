@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A small font: letters and digits that are drawn in one stroke, as splines."""
+"""A small font of letters and digits. Each is one stroke of splines."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-_POINTS_BETWEEN = 24  # on the spline between two of the points below
+_POINTS_BETWEEN = 24  # points on the spline between two of the points below
 
 # Each letter is a list of pieces that meet in corners; the curve of a piece passes through its points. x points right, y
 # up; a letter is 1 high.
@@ -103,7 +103,7 @@ LETTERS = tuple(_PIECES)
 
 
 def letter_stroke(letter: str) -> np.ndarray:
-    """The stroke of a letter, ``(N, 2)`` points in the order of writing, 1 high, its middle at the origin.
+    """The stroke of a letter: ``(N, 2)`` points in the order of writing. Its height is 1, its centre the origin.
 
     Args:
         letter: One of `LETTERS`.
@@ -121,7 +121,7 @@ def letter_stroke(letter: str) -> np.ndarray:
 
 def _curve(through: np.ndarray) -> np.ndarray:
     """A natural cubic spline through ``(N, 2)`` points, parametrised by the square root of their distances."""
-    # Centripetal parameters keep the curve from swinging out between points at uneven distances (Lee, 1989).
+    # Centripetal parameters prevent overshoots of the curve between points at uneven distances (Lee, 1989).
     knots = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(through, axis=0), axis=1) ** 0.5)])
     times = np.interp(
         np.arange((len(knots) - 1) * _POINTS_BETWEEN + 1) / _POINTS_BETWEEN, range(len(knots)), knots

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A Franka Panda with a pen at a table: the arm that ships inside gymnasium-robotics."""
+"""A Franka Panda with a pen at a table. The model of the arm comes with gymnasium-robotics."""
 
 from __future__ import annotations
 
@@ -15,35 +15,35 @@ N_ARM_JOINTS = 7
 JOINT_NAMES = (*(f"joint_{i}" for i in range(1, N_ARM_JOINTS + 1)), "finger_1", "finger_2")
 TABLE, PEN_TIP = "table", "pen_tip"
 GRIP = 0.007  # opening of each finger around the pen [m]
-# A posture with the pen nearly upright at the middle of the sheet, its tip 5 mm too low; of all postures for a place of the
-# pen, the arm takes the one next to this.
+# A posture with the pen nearly upright at the middle of the sheet, with its tip 5 mm too low. Among all postures for a
+# position of the pen, the arm takes the one nearest to this.
 HOME = np.array([0.0, 0.3125, 0.0, -2.3932, 0.0, 1.135, 0.7854, GRIP, GRIP])  # [rad], fingers [m]
-ARM_GROUP, SCENE_GROUP = 0, 1  # of visible geoms
-PEN_TRAVEL = 0.01  # how far the tip gives way before the pen itself touches the table [m]
+ARM_GROUP, SCENE_GROUP = 0, 1  # MuJoCo's groups of visible geoms
+PEN_TRAVEL = 0.01  # how deep the soft tip can sink before the pen's barrel touches the table [m]
 
-_TOLERANCE = 1e-4  # of limits [rad; m]
+_TOLERANCE = 1e-4  # by which positions may exceed their limits [rad; m]
 _ASSETS = "envs/assets/kitchen_franka/franka_assets"
 _PEN_LENGTH = 0.30  # from the last joint's frame to the tip, along its axis [m]
 _PEN_RADIUS = 0.006  # [m]
 _TABLE_SIZE = (0.66, 0.80, 0.04)  # [m]
-# Of the position controllers, by joint: stiffness [N m/rad], and damping that lets the arm lag by 0.03 s. The model's own
-# gains let it lag by 0.1 s, more in some joints than in others, which bends the stroke.
+# Stiffness of the position controllers by joint [N m/rad], and the lag of the arm that their damping causes. With the
+# model's own gains the arm lags by 0.1 s, in some joints more than in others, which bends the stroke.
 _STIFFNESS = (4500.0, 4500.0, 3500.0, 3500.0, 2000.0, 2000.0, 2000.0)
 _LAG = 0.03  # [s]
-_FORCES = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)  # [N m]
-# The sheet collides with nothing; the table with arm and pen; the pen not with the fingers that hold it.
+_FORCES = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)  # largest torques [N m]
+# The sheet collides with nothing. The table collides with arm and pen. The pen does not collide with the fingers.
 _ARM_BIT, _PEN_BIT = 1, 2
 _WHITE, _GREY, _PEN_COLOUR = (0.80, 0.80, 0.79, 1.0), (0.32, 0.34, 0.37, 1.0), (0.10, 0.22, 0.55, 1.0)
 
 
-def make_panda(sheet: np.ndarray, picture_size: tuple[int, int] = (480, 640)) -> mujoco.MjModel:
-    """The arm, its pen and the table; its nine joints and controllers are in the order of `JOINT_NAMES`.
+def make_panda(sheet: np.ndarray, image_size: tuple[int, int] = (480, 640)) -> mujoco.MjModel:
+    """Makes the model of the arm, its pen and the table. Joints and controllers are in the order of `JOINT_NAMES`.
 
     The frame is that of the arm's base: x forward, y to its left, z up; the table's top is at z = 0.
 
     Args:
-        sheet: ``(H, W, 3)`` uint8 picture on the sheet of paper, its top row at the largest y.
-        picture_size: Height and width of the largest picture that will be rendered [pixels].
+        sheet: ``(H, W, 3)`` uint8 image on the sheet of paper, its top row at the largest y.
+        image_size: Height and width of the largest image that will be rendered [pixels].
     """
     spec = _read_arm()
     _add_pen(spec)
@@ -56,7 +56,7 @@ def make_panda(sheet: np.ndarray, picture_size: tuple[int, int] = (480, 640)) ->
         actuator.forcerange[:] = -force, force
         spec.joint(actuator.target).damping[:] = 1.0
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.visual.global_.offheight, spec.visual.global_.offwidth = picture_size
+    spec.visual.global_.offheight, spec.visual.global_.offwidth = image_size
     return spec.compile()
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of the arm and of what it has drawn."""
+"""Images of the arm and of the drawn line."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lerobot_pf2mp.envs.handwriting.sheet import SHEET_CENTRE
 from lerobot_pf2mp.envs.handwriting.stroke import evenly_spaced
 from lerobot_pf2mp.envs.headless import rendering
 
-# lookat [m], distance [m], azimuth and elevation [degrees]; whether the arm is shown
+# lookat [m], distance [m], azimuth and elevation [degrees], and whether the arm is shown.
 CAMERAS = {
     "arm": ((0.40, 0.0, 0.13), 1.02, 130.0, -34.0, True),
     "top": ((*SHEET_CENTRE, 0.0), 0.42, 90.0, -89.9, False),
@@ -26,32 +26,32 @@ CAMERAS = {
 
 _INK = np.array([0.05, 0.10, 0.45, 1.0], dtype=np.float32)
 _INK_WIDTH = 0.003  # [m]
-_INK_HEIGHT = 0.001  # above the table, to be seen on the sheet [m]
-_SPACING, _MAX_LINES = 0.003, 1000  # of the lines that the ink is drawn of [m]
+_INK_HEIGHT = 0.001  # above the table, so that it is visible on the sheet [m]
+_SPACING, _MAX_LINES = 0.003, 1000  # smallest length [m] and largest number of the line segments of the ink
 
 
 class PandaCamera:
     """Renders the arm, the sheet and the ink.
 
     Args:
-        model: Of `make_panda`.
+        model: A model from `make_panda`.
         view: One of `CAMERAS`.
-        picture_size: Height and width [pixels].
+        image_size: Height and width [pixels].
     """
 
-    def __init__(self, model: mujoco.MjModel, view: str, picture_size: tuple[int, int]) -> None:
-        self._model, self._view, self._picture_size = model, CAMERAS[view], picture_size
+    def __init__(self, model: mujoco.MjModel, view: str, image_size: tuple[int, int]) -> None:
+        self._model, self._view, self._image_size = model, CAMERAS[view], image_size
         self._viewer: OffScreenViewer | None = None
 
-    def picture(self, data: mujoco.MjData, ink: Ink) -> np.ndarray:
-        """A picture ``(H, W, 3)`` uint8.
+    def render(self, data: mujoco.MjData, ink: Ink) -> np.ndarray:
+        """Renders an image ``(H, W, 3)`` uint8.
 
         Args:
             data: The state of the model, always the same object.
-            ink: What has been drawn.
+            ink: The drawn line.
 
         Raises:
-            RuntimeError: If this machine cannot render; says what to install.
+            RuntimeError: If this machine cannot render; the message says what to install.
         """
         with rendering():
             if self._viewer is None:
@@ -68,21 +68,21 @@ class PandaCamera:
             self._viewer = None
 
     def _make_viewer(self, data: mujoco.MjData) -> OffScreenViewer:
-        height, width = self._picture_size
-        # Not MuJoCo's own renderer: it chooses how to reach OpenGL when MuJoCo is imported.
+        height, width = self._image_size
+        # Not MuJoCo's own renderer, because that chooses its OpenGL backend when MuJoCo is imported.
         viewer = OffScreenViewer(self._model, data, width, height, max_geom=2 * _MAX_LINES)
         viewer.vopt.sitegroup[:] = 0
         camera = viewer.cam
         lookat, camera.distance, camera.azimuth, camera.elevation, shows_arm = self._view
         viewer.vopt.geomgroup[ARM_GROUP] = shows_arm
         camera.lookat[:] = lookat
-        # A renderer that nobody closes would complain when Python ends.
+        # Without this, a renderer that is not closed prints an error when Python exits.
         atexit.register(_close, weakref.ref(viewer))
         return viewer
 
 
-def _add_ink(viewer: OffScreenViewer, places: np.ndarray) -> None:
-    for start, end in pairwise(places):
+def _add_ink(viewer: OffScreenViewer, positions: np.ndarray) -> None:
+    for start, end in pairwise(positions):
         length = math.dist(start, end)
         ahead = np.array([*(end - start) / length, 0.0])
         up = np.array([0.0, 0.0, 1.0])

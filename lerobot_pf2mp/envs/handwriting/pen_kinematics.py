@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joint positions of the Panda for a place of its pen, and back. The solver is mink's."""
+"""Inverse and forward kinematics of the Panda's pen. The solver is mink's."""
 
 from __future__ import annotations
 
@@ -9,22 +9,21 @@ import numpy as np
 
 from lerobot_pf2mp.envs.handwriting.panda import HOME, PEN_TIP
 
-_UPRIGHT = np.array(
-    [[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]
-)  # of the pen: its axis points down
+# Rotation of the upright pen: its axis points down.
+_UPRIGHT = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _MAX_ITERATIONS = 100
 _CONVERGED = 1e-6  # last change of a joint [rad]
 _LARGEST_ERROR = 1e-4  # [m] and [rad]
 
 
 class PenKinematics:
-    """Where the pen is for joint positions, and which joint positions hold it upright somewhere.
+    """Turns positions of the upright pen into joint positions, and joint positions into positions of the pen.
 
-    The arm has one joint more than needed. Of all postures, the solution is the one next to `panda.HOME`: a function of the
-    pen's place alone, and as smooth.
+    The arm has one joint more than needed. The solution is the posture nearest to `panda.HOME`. So it is a function of the
+    pen's position only, and it is smooth.
 
     Args:
-        model: Of `make_panda`.
+        model: A model from `make_panda`.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
@@ -35,19 +34,19 @@ class PenKinematics:
         self._posture.set_target(HOME)
         self._limits = [mink.ConfigurationLimit(model)]
 
-    def joints(self, place: np.ndarray, height: float = 0.0) -> np.ndarray:
-        """Joint positions ``(9,)`` with the pen upright at a place [rad], fingers [m].
+    def joints(self, position: np.ndarray, height: float = 0.0) -> np.ndarray:
+        """Joint positions ``(9,)`` with the pen upright at a position [rad], fingers [m].
 
         Args:
-            place: ``(2,)`` x, y of the pen's tip [m].
+            position: ``(2,)`` x, y of the pen's tip [m].
             height: z of the pen's tip [m].
 
         Raises:
-            ValueError: If the arm does not reach there.
+            ValueError: If the arm does not reach this position.
         """
-        target = mink.SO3.from_matrix(_UPRIGHT), np.array([*place, height])
+        target = mink.SO3.from_matrix(_UPRIGHT), np.array([*position, height])
         self._pen.set_target(mink.SE3.from_rotation_and_translation(*target))
-        self._configuration.update(HOME)  # from elsewhere the search may go astray
+        self._configuration.update(HOME)  # from another start the search may fail
         for _ in range(_MAX_ITERATIONS):
             velocity = mink.solve_ik(
                 self._configuration, [self._pen, self._posture], 1.0, "daqp", limits=self._limits
@@ -56,16 +55,18 @@ class PenKinematics:
             if np.abs(velocity).max() < _CONVERGED:
                 break
         if np.abs(self._pen.compute_error(self._configuration)).max() > _LARGEST_ERROR:
-            raise ValueError(f"the arm must reach the pen's place x, y [m], got {np.asarray(place).tolist()}")
+            raise ValueError(
+                f"the arm must reach the pen's position x, y [m], got {np.asarray(position).tolist()}"
+            )
         return self._configuration.q.copy()
 
-    def way(self, places: np.ndarray) -> np.ndarray:
-        """Joint positions ``(N, 9)`` for ``(N, 2)`` places of the pen, one after the other.
+    def joint_trajectory(self, positions: np.ndarray) -> np.ndarray:
+        """Joint positions ``(N, 9)`` for ``(N, 2)`` positions of the pen, one after the other.
 
         Raises:
             ValueError: If the arm does not reach one of them.
         """
-        return np.array([self.joints(place) for place in places])
+        return np.array([self.joints(position) for position in positions])
 
     def tips(self, joints: np.ndarray) -> np.ndarray:
         """Positions ``(N, 3)`` of the pen's tip for ``(N, 9)`` joint positions [m]."""

@@ -19,11 +19,11 @@ _SMALLEST = 0.001  # [m]
 
 @dataclass(frozen=True)
 class Disc:
-    """A round region.
+    """A circular region.
 
     Args:
-        centre: x, y [m].
-        radius: [m].
+        centre: x, y of its centre [m].
+        radius: Its radius [m].
 
     Raises:
         ValueError: If the centre is not two finite coordinates, or the radius is below 1 mm.
@@ -38,13 +38,13 @@ class Disc:
         if not (np.isfinite(self.radius) and self.radius >= _SMALLEST):
             raise ValueError(f"the radius of a disc must be at least {_SMALLEST} m, got {self.radius}")
 
-    def clearance(self, way: np.ndarray) -> float:
-        """Distance of the line through ``(N, 2)`` points [m]; negative inside, by the depth."""
-        return float(line_of(way).distance(Point(self.centre))) - self.radius
+    def clearance(self, path: np.ndarray) -> float:
+        """Distance of the line through ``(N, 2)`` points to the region [m]; inside it minus the depth."""
+        return float(line_of(path).distance(Point(self.centre))) - self.radius
 
     @property
     def outline(self) -> np.ndarray:
-        """``(N, 2)`` corners of a polygon that looks like it [m]."""
+        """``(N, 2)`` corners of a polygon that approximates it [m]."""
         angles = np.linspace(0.0, 2 * np.pi, _CORNERS_OF_DISC, endpoint=False)
         return np.array(self.centre) + self.radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
@@ -54,10 +54,10 @@ class Area:
     """A region with straight sides.
 
     Args:
-        corners: x, y of each [m], in order.
+        corners: x, y of each corner [m], in order.
 
     Raises:
-        ValueError: If they are not at least three finite places of a polygon that does not cross itself.
+        ValueError: If they are not at least three finite corners of a polygon that does not cross itself.
     """
 
     corners: tuple[tuple[float, float], ...]
@@ -66,21 +66,21 @@ class Area:
         shape = np.shape(self.corners)
         if len(shape) != 2 or shape[0] < 3 or shape[1] != 2 or not np.isfinite(self.corners).all():
             raise ValueError(
-                f"the corners of a polygon must be at least three finite places x, y [m], got {self.corners}"
+                f"the corners of a polygon must be at least three finite positions x, y [m], got {self.corners}"
             )
         if not self._polygon.is_valid or self._polygon.area < _SMALLEST**2:
             raise ValueError(f"a polygon must have an inside and not cross itself, got {self.corners}")
 
-    def clearance(self, way: np.ndarray) -> float:
-        """Distance of the line through ``(N, 2)`` points [m]; negative inside, by the depth."""
+    def clearance(self, path: np.ndarray) -> float:
+        """Distance of the line through ``(N, 2)`` points to the region [m]; inside it minus the depth."""
         polygon = self._polygon
-        line = line_of(way)
+        line = line_of(path)
         inside: BaseGeometry = line.intersection(polygon)
         if inside.is_empty:
             return float(line.distance(polygon))
-        # The deepest place of a line need not be one of its corners.
-        places = shapely.points(shapely.get_coordinates(inside.segmentize(_SMALLEST)))
-        return -float(shapely.distance(places, polygon.exterior).max())
+        # The deepest point of a line need not be one of its corners.
+        points = shapely.points(shapely.get_coordinates(inside.segmentize(_SMALLEST)))
+        return -float(shapely.distance(points, polygon.exterior).max())
 
     @property
     def outline(self) -> np.ndarray:
@@ -102,7 +102,7 @@ def region_of(content: Any) -> Region:
         content: ``{"centre": [x, y], "radius": r}`` or ``{"corners": [[x, y], ...]}`` [m].
 
     Raises:
-        ValueError: If it describes none.
+        ValueError: If it does not describe a region.
     """
     try:
         if set(content) == {"centre", "radius"}:
@@ -110,7 +110,7 @@ def region_of(content: Any) -> Region:
         if set(content) == {"corners"}:
             return Area(tuple(tuple(corner) for corner in _numbers(content["corners"])))
     except TypeError:
-        pass  # not numbers where there should be numbers: the message below says what should be there
+        pass  # a value is not a number; the error is raised below
     raise ValueError(
         'a region must be {"centre": [x, y], "radius": r} or {"corners": [[x, y], ...]} in metres, '
         f"got {content}"
@@ -118,7 +118,7 @@ def region_of(content: Any) -> Region:
 
 
 def _numbers(content: Any) -> Any:
-    """The content, if it is numbers in rows of one length.
+    """The content, if it consists of numbers in rows of equal length.
 
     Raises:
         TypeError: If it is not.

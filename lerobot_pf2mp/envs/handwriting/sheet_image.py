@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The picture on the sheet: what is to be written, and the restricted regions."""
+"""The image on the sheet: the letter to write, and the restricted regions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _SIDE = 1024  # [pixels]
 
 
 def draw_sheet(scene: WritingScene) -> np.ndarray:
-    """A square picture ``(H, W, 3)`` uint8 of the sheet, its top row at the largest y."""
+    """A square image ``(H, W, 3)`` uint8 of the sheet, its top row at the largest y."""
     image = Image.new("RGB", (_SIDE, _SIDE), _PAPER)
     draw = ImageDraw.Draw(image)
     for region in scene.regions:
@@ -25,6 +25,6 @@ def draw_sheet(scene: WritingScene) -> np.ndarray:
     return np.asarray(image)
 
 
-def _pixels(places: np.ndarray) -> list[tuple[float, float]]:
-    across = (places - np.array(SHEET_CENTRE)) / SHEET_SIDE + 0.5
-    return [(float(x) * _SIDE, float(1 - y) * _SIDE) for x, y in across]
+def _pixels(positions: np.ndarray) -> list[tuple[float, float]]:
+    relative = (positions - np.array(SHEET_CENTRE)) / SHEET_SIDE + 0.5
+    return [(float(x) * _SIDE, float(1 - y) * _SIDE) for x, y in relative]

@@ -9,16 +9,16 @@ from shapely import LineString, Point
 
 
 def line_of(points: np.ndarray) -> LineString | Point:
-    """The line through ``(N, 2)`` points; a single place where it would have no length."""
+    """The line through ``(N, 2)`` points; a single point if all of them are equal."""
     return Point(points[0]) if (points == points[0]).all() else LineString(points)
 
 
 def evenly_spaced(points: np.ndarray, spacing: float) -> np.ndarray:
-    """Points on the same line ``(N, 2)``, about `spacing` apart, with both ends.
+    """Points ``(N, 2)`` on a line, about `spacing` apart, including both ends.
 
     Args:
         points: ``(N, 2)`` corners of the line.
-        spacing: In the unit of the points.
+        spacing: Distance between neighbours, in the unit of the points.
     """
     line = line_of(points)
     if isinstance(line, Point):
@@ -28,5 +28,5 @@ def evenly_spaced(points: np.ndarray, spacing: float) -> np.ndarray:
 
 
 def distances(points: np.ndarray, stroke: np.ndarray) -> np.ndarray:
-    """Distance of each of ``(N, 2)`` points to the line through others ``(M, 2)``."""
+    """Distances ``(N,)`` of ``(N, 2)`` points to the line through the points ``(M, 2)`` of a stroke."""
     return shapely.distance(shapely.points(points), line_of(stroke))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is written on the sheet, and the regions that the pen must not enter."""
+"""The stroke to write on the sheet, and the regions that the pen must not enter."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ from lerobot_pf2mp.envs.handwriting.sheet import (
 from lerobot_pf2mp.envs.handwriting.stroke import distances, evenly_spaced, line_of
 
 SHEET_CORNERS = np.array(SHEET_CENTRE) - SHEET_SIDE / 2, np.array(SHEET_CENTRE) + SHEET_SIDE / 2
-_SPACING = 0.001  # of the letter's points [m]
+_SPACING = 0.001  # between the letter's points [m]
 _RADII = (0.006, 0.045)  # smallest and largest of a letter's regions [m]
-_GRID = 0.002  # of the places where a region may be put [m]
-_MIN_LENGTH = 0.02  # of a stroke [m]
+_GRID = 0.002  # spacing of the candidate centres of regions [m]
+_MIN_LENGTH = 0.02  # smallest length of a stroke [m]
 
 
 @dataclass(frozen=True)
 class WritingScene:
-    """A stroke to draw, and regions to keep out of.
+    """A stroke to draw, and regions that the pen must not enter.
 
     Args:
-        name: What is written, for titles and file names.
-        stroke: ``(N, 2)`` places x, y of the pen in the frame of the robot's base [m], in the order of writing.
+        name: Name of the letter or the scene file, for titles and file names.
+        stroke: ``(N, 2)`` positions x, y of the pen in the frame of the robot's base [m], in the order of writing.
         regions: The restricted regions.
 
     Raises:
@@ -58,28 +58,28 @@ class WritingScene:
                     f"regions must leave the stroke free, got one that blocks {self.name}: {region}"
                 )
 
-    def clearance(self, way: np.ndarray) -> float:
+    def clearance(self, path: np.ndarray) -> float:
         """Smallest distance of the line through ``(N, 2)`` points to a region [m], negative inside; inf without regions."""
-        return min((region.clearance(way) for region in self.regions), default=math.inf)
+        return min((region.clearance(path) for region in self.regions), default=math.inf)
 
 
-def is_on_sheet(places: np.ndarray) -> bool:
-    """Whether all of ``(..., 2)`` places x, y [m] are on the sheet."""
+def is_on_sheet(positions: np.ndarray) -> bool:
+    """Whether all of ``(..., 2)`` positions x, y [m] are on the sheet."""
     low, high = SHEET_CORNERS
-    return bool((places >= low).all() and (places <= high).all())
+    return bool((positions >= low).all() and (positions <= high).all())
 
 
-def check_on_sheet(places: np.ndarray, name: str) -> None:
-    """Checks that the pen reaches all of ``(..., 2)`` places x, y [m].
+def check_on_sheet(positions: np.ndarray, name: str) -> None:
+    """Checks that the pen reaches all of ``(..., 2)`` positions x, y [m].
 
     Raises:
         ValueError: If one is not finite or not on the sheet.
     """
-    if places.ndim < 1 or places.shape[-1] != 2 or not np.isfinite(places).all():
-        raise ValueError(f"{name} must be finite places x, y [m], got {places.tolist()}")
-    if not is_on_sheet(places):
+    if positions.ndim < 1 or positions.shape[-1] != 2 or not np.isfinite(positions).all():
+        raise ValueError(f"{name} must be finite positions x, y [m], got {positions.tolist()}")
+    if not is_on_sheet(positions):
         low, high = SHEET_CORNERS
-        outside = next(place for place in places.reshape(-1, 2) if not is_on_sheet(place))
+        outside = next(position for position in positions.reshape(-1, 2) if not is_on_sheet(position))
         raise ValueError(
             f"{name} must lie on the sheet, where the arm reaches with an upright pen, x in [{low[0]:g}, {high[0]:g}] "
             f"and y in [{low[1]:g}, {high[1]:g}] m of its base; got {np.round(outside, 4).tolist()}"
@@ -94,20 +94,20 @@ def make_writing_scene(
     n_regions: int = N_REGIONS,
     scene_file: str | Path | None = None,
 ) -> WritingScene:
-    """A letter in the middle of the sheet with regions in its bays, or what a file describes.
+    """Makes a letter in the middle of the sheet with regions in its concave parts, or the scene of a file.
 
-    The regions of a letter are the largest discs, one after the other, whose centre is in the letter's convex hull and
-    that keep `region_gap` from its stroke.
+    The regions of a letter are discs. Each is the largest one whose centre is in the convex hull of the letter and that
+    keeps a distance of `region_gap` to the stroke and to the discs before it.
 
     Args:
         letter: One of `letters.LETTERS`.
-        letter_height: [m].
-        region_gap: Between the stroke and the regions [m].
-        n_regions: Most regions; there are fewer where they find no room.
+        letter_height: Height of the letter [m].
+        region_gap: Distance between the stroke and the regions [m].
+        n_regions: Largest number of regions; there are fewer if there is no room for them.
         scene_file: A JSON file with a stroke and regions instead of a letter, see `read_writing_scene`.
 
     Raises:
-        ValueError: If an argument breaks its rule, or the stroke is out of reach or blocked.
+        ValueError: If an argument breaks its rule, or the stroke leaves the sheet or is blocked by a region.
         FileNotFoundError: If there is no such file.
     """
     if scene_file is not None:
@@ -121,18 +121,18 @@ def make_writing_scene(
     whole = np.array(SHEET_CENTRE) + letter_height * letter_stroke(letter)
     check_on_sheet(whole, f"the stroke of {letter}")  # before it is divided into millimetres
     stroke = evenly_spaced(whole, _SPACING)
-    return WritingScene(letter, stroke, _regions_in_the_bays(stroke, region_gap, n_regions))
+    return WritingScene(letter, stroke, _regions_in_concave_parts(stroke, region_gap, n_regions))
 
 
 def read_writing_scene(path: Path) -> WritingScene:
-    """The scene that a JSON file describes.
+    """Reads the scene that a JSON file describes.
 
     Args:
-        path: Of a file ``{"stroke": [[x, y], ...], "regions": [...]}``, places in the frame of the robot's base [m], regions
-            as for `region_of`.
+        path: A file ``{"stroke": [[x, y], ...], "regions": [...]}``, with positions in the frame of the robot's base [m] and
+            regions as for `region_of`.
 
     Raises:
-        ValueError: If the file does not describe one, or the stroke is out of reach or blocked.
+        ValueError: If the file does not describe a scene, or the stroke leaves the sheet or is blocked by a region.
         FileNotFoundError: If there is no such file.
     """
     try:
@@ -145,35 +145,40 @@ def read_writing_scene(path: Path) -> WritingScene:
     regions = content.get("regions", [])
     if not isinstance(regions, list):
         raise ValueError(f"the regions in {path} must be a list, got {regions}")
-    places = _places(content["stroke"], path)
-    check_on_sheet(places, f"the stroke of {path.stem}")
-    stroke = evenly_spaced(places, _SPACING)
+    positions = _stroke_of(content["stroke"], path)
+    check_on_sheet(positions, f"the stroke of {path.stem}")
+    stroke = evenly_spaced(positions, _SPACING)
     return WritingScene(path.stem, stroke, tuple(region_of(region) for region in regions))
 
 
-def _places(content: Any, path: Path) -> np.ndarray:
+def _stroke_of(content: Any, path: Path) -> np.ndarray:
     try:
-        places = np.array(content, dtype=np.float64)
+        positions = np.array(content, dtype=np.float64)
     except (TypeError, ValueError):
-        places = np.empty(0)
-    if places.ndim != 2 or places.shape[1] != 2 or len(places) < 2 or not np.isfinite(places).all():
-        raise ValueError(f"the stroke in {path} must be two or more finite places [x, y] in metres")
-    return places
+        positions = np.empty(0)
+    if (
+        positions.ndim != 2
+        or positions.shape[1] != 2
+        or len(positions) < 2
+        or not np.isfinite(positions).all()
+    ):
+        raise ValueError(f"the stroke in {path} must be two or more finite positions [x, y] in metres")
+    return positions
 
 
-def _regions_in_the_bays(stroke: np.ndarray, gap: float, n_regions: int) -> tuple[Region, ...]:
+def _regions_in_concave_parts(stroke: np.ndarray, gap: float, n_regions: int) -> tuple[Region, ...]:
     hull = MultiPoint(stroke).convex_hull
     if not isinstance(hull, Polygon):
         return ()
     left, bottom, right, top = hull.bounds
     x, y = np.meshgrid(np.arange(left, right, _GRID), np.arange(bottom, top, _GRID))
-    places = np.stack([x.ravel(), y.ravel()], axis=1)
-    places = places[shapely.contains_xy(hull, places)]
-    room = distances(places, stroke) - gap
+    centres = np.stack([x.ravel(), y.ravel()], axis=1)
+    centres = centres[shapely.contains_xy(hull, centres)]
+    room = distances(centres, stroke) - gap
     regions: list[Disc] = []
     while len(regions) < n_regions and room.size and room.max() >= _RADII[0]:
         best = int(room.argmax())
-        disc = Disc((float(places[best, 0]), float(places[best, 1])), float(min(room[best], _RADII[1])))
+        disc = Disc((float(centres[best, 0]), float(centres[best, 1])), float(min(room[best], _RADII[1])))
         regions.append(disc)
-        room = np.minimum(room, np.linalg.norm(places - places[best], axis=1) - disc.radius - gap)
+        room = np.minimum(room, np.linalg.norm(centres - centres[best], axis=1) - disc.radius - gap)
     return tuple(regions)

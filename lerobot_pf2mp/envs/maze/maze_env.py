@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A ball in a maze: gymnasium-robotics' PointMaze with positions as actions and collisions reported."""
+"""A ball in a maze: gymnasium-robotics' PointMaze with positions as actions, and with collision reports."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from lerobot_pf2mp.envs.maze.maze_image import MazePicture
+from lerobot_pf2mp.envs.maze.maze_image import MazeImage
 from lerobot_pf2mp.envs.maze.point_maze import BALL_RADIUS, MAZE_MAPS, make_point_maze, step_physics
 from lerobot_pf2mp.envs.maze.swept_ball import SweptBall
 
@@ -27,18 +27,19 @@ class MazeEnv(gym.Env):
     forces, actions are the ball's next positions, as in Section V-B of the paper.
 
     ## Action space
-    ``Box(2)``: the next position x, y of the ball [m]. Positions outside the map are moved to its border, which is wall.
+    ``Box(2)``: the next position x, y of the ball [m]. Positions outside the map are clipped to its border, which is wall.
 
     ## Observation space
     ``Dict``: ``agent_pos`` ``(2,)``, the ball's position [m], and ``environment_state`` ``(2,)``, the goal's [m].
 
     ## Rewards
-    -1.0 on the first step in collision of an episode, 0.0 otherwise; the sum over an episode is minus its collision.
+    -1.0 on the first step with a collision in an episode, 0.0 otherwise. So the return of an episode is -1 with a collision
+    and 0 without.
 
     ## Information
     ``is_success``: the ball is within 0.45 m of the goal. ``is_collision``: it has touched a wall in this episode.
-    ``clearance``: the smallest distance to a wall on the way of this step [m], negative inside one. ``path_length``: the
-    length of the way in this episode [m].
+    ``clearance``: the smallest distance to a wall during this step [m], negative inside one. ``path_length``: the length of
+    the executed path in this episode [m].
 
     ## Starting state
     PointMaze's: start and goal in different free cells, each up to 0.25 m off the centre on both axes. ``reset(options=
@@ -49,13 +50,13 @@ class MazeEnv(gym.Env):
 
     Args:
         maze_map: As for `parse_maze_map`.
-        control: ``exact``, the ball reaches every action, as the paper assumes of its low-level controller; or ``pd``, a
-            PD controller drives it there in full physics. In both the way between two positions is swept for contact.
+        control: ``exact``: the ball reaches every action, as the paper assumes of its low-level controller. ``pd``: a PD
+            controller drives it there in full physics. With both, the path between two positions is checked for contact.
         collision_radius: Distance of the ball's centre to a wall below which it collides [m]: 0.1, the ball's radius, or 0.
         fps: Control frequency [Hz], a divisor of the physics' 100 Hz.
         terminate_on_success: Whether an episode ends at the goal.
         render_mode: ``rgb_array`` or None.
-        render_size: Longer side of the picture [pixels].
+        render_size: Longer side of the image [pixels].
 
     Raises:
         ValueError: If an argument breaks its rule.
@@ -94,7 +95,7 @@ class MazeEnv(gym.Env):
         self.metadata = {**self.metadata, "render_fps": fps}
         self._n_substeps = physics_fps // fps
         self._swept_ball = SweptBall(spec, collision_radius)
-        self._picture = MazePicture(self._maze.maze.maze_map, render_size)
+        self._image = MazeImage(self._maze.maze.maze_map, render_size)
         border = np.array([self._maze.maze.x_map_center, self._maze.maze.y_map_center], dtype=np.float32)
         self.action_space: spaces.Box = spaces.Box(-border, border, dtype=np.float32)
         self.observation_space = spaces.Dict(
@@ -110,10 +111,10 @@ class MazeEnv(gym.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Starts an episode; see the class for the options.
+        """Starts an episode. The options are described in the class docstring.
 
         Raises:
-            ValueError: If a start or goal asked for is in a wall or outside the map.
+            ValueError: If the start or goal in `options` is in a wall or outside the map.
         """
         super().reset(seed=seed)
         self._maze.reset(seed=seed)
@@ -130,7 +131,7 @@ class MazeEnv(gym.Env):
         return self._observation(), self._info(clearance)
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
-        """Moves the ball to, or towards, ``(2,)`` a position [m].
+        """Moves the ball to a position ``(2,)`` [m], or towards it with ``control="pd"``.
 
         Raises:
             ValueError: If the action is not finite.
@@ -141,22 +142,22 @@ class MazeEnv(gym.Env):
         if target.shape != (2,) or not np.isfinite(target).all():
             raise ValueError(f"an action must be two finite coordinates [m], got {action}")
         target = target.clip(self.action_space.low, self.action_space.high)
-        way = self._move_exactly(target) if self._control == "exact" else self._drive(target)
-        clearance = self._swept_ball.path_clearance(np.array(way))
+        path = self._move_exactly(target) if self._control == "exact" else self._drive(target)
+        clearance = self._swept_ball.path_clearance(np.array(path))
         first_collision = clearance < 0 and not self._collisions
         if clearance < 0:
-            self._collisions.append(way[-1])
-        self._path.extend(way[1:])
-        self._path_length += sum(math.dist(*pair) for pair in pairwise(way))
+            self._collisions.append(path[-1])
+        self._path.extend(path[1:])
+        self._path_length += sum(math.dist(*pair) for pair in pairwise(path))
         info = self._info(clearance)
         terminated = self._terminate_on_success and info["is_success"]
         return self._observation(), -1.0 if first_collision else 0.0, terminated, False, info
 
     def render(self) -> np.ndarray | None:
-        """A top view ``(H, W, 3)`` uint8: walls, goal, ball, its way so far, and crosses where it collided."""
+        """A top view ``(H, W, 3)`` uint8: walls, goal, ball, its path so far, and crosses at collisions."""
         if self.render_mode is None:
             return None
-        return self._picture.draw(
+        return self._image.draw(
             ball=self._position, goal=self._maze.goal, path=self._path, collisions=self._collisions
         )
 
@@ -178,12 +179,12 @@ class MazeEnv(gym.Env):
         start = self._position
         dt = self._maze.model.opt.timestep
         line_velocity = (target - start) / (self._n_substeps * dt)
-        way = [start]
+        path = [start]
         for substep in range(1, self._n_substeps + 1):
             reference = start + line_velocity * (substep * dt)
             step_physics(self._maze.model, self._maze.data, reference, line_velocity)
-            way.append(self._position)
-        return way
+            path.append(self._position)
+        return path
 
     def _free_position(self, position: Any, name: str) -> np.ndarray:
         position = np.asarray(position, dtype=np.float64)

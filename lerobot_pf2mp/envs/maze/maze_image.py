@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Top-down pictures of a maze, drawn with Pillow: no OpenGL needed."""
+"""Top-down images of a maze, drawn with Pillow, without OpenGL."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ GOAL = (214, 39, 40)
 PATH = (31, 119, 180)
 COLLISION = (200, 20, 20)
 
-_SUPERSAMPLING = 2  # Pillow does not smooth lines by itself
+_SUPERSAMPLING = 2  # because Pillow does not smooth lines
 
 
-class MazePicture:
+class MazeImage:
     """Draws the state of a maze of unit cells centred at the origin.
 
     Args:
         maze_map: Rows of 0 (free) and 1 (wall), north first.
-        size: Longer side of the picture [pixels].
+        size: Longer side of the image [pixels].
     """
 
     def __init__(self, maze_map: Sequence[Sequence[int]], size: int) -> None:
         if size < 32:
             raise ValueError(f"render_size must be at least 32 pixels, got {size}")
         self._rows, self._columns = len(maze_map), len(maze_map[0])
-        scale = size / max(self._rows, self._columns)
-        # Video encoders want even sides.
-        self._size = (2 * round(self._columns * scale / 2), 2 * round(self._rows * scale / 2))
-        self._scale = _SUPERSAMPLING * scale  # drawn pixels for each metre
+        zoom = size / max(self._rows, self._columns)
+        # Video encoders require even sides.
+        self._size = (2 * round(self._columns * zoom / 2), 2 * round(self._rows * zoom / 2))
+        self._zoom = _SUPERSAMPLING * zoom  # [pixels/m], before the image is reduced
         self._background = Image.new(
             "RGB", (_SUPERSAMPLING * self._size[0], _SUPERSAMPLING * self._size[1]), FLOOR
         )
@@ -42,7 +42,7 @@ class MazePicture:
         for i, row in enumerate(maze_map):
             for j, cell in enumerate(row):
                 if cell == 1:
-                    corners = [j * self._scale, i * self._scale, (j + 1) * self._scale, (i + 1) * self._scale]
+                    corners = [j * self._zoom, i * self._zoom, (j + 1) * self._zoom, (i + 1) * self._zoom]
                     draw.rectangle(corners, fill=WALL, outline=WALL_EDGE)
 
     @property
@@ -57,7 +57,7 @@ class MazePicture:
         path: Sequence[np.ndarray],
         collisions: Sequence[np.ndarray],
     ) -> np.ndarray:
-        """The picture, ``(H, W, 3)`` uint8.
+        """Draws the image, ``(H, W, 3)`` uint8.
 
         Args:
             ball: ``(2,)`` position of the ball [m].
@@ -70,23 +70,23 @@ class MazePicture:
         self._disc(draw, goal, 0.2, GOAL)
         if len(path) > 1:
             draw.line(
-                [self._pixel(p) for p in path], fill=PATH, width=round(0.06 * self._scale), joint="curve"
+                [self._pixel(p) for p in path], fill=PATH, width=round(0.06 * self._zoom), joint="curve"
             )
         self._disc(draw, ball, 0.1, BALL)
         for position in collisions:
             x, y = self._pixel(position)
-            arm, width = 0.13 * self._scale, round(0.06 * self._scale)
+            arm, width = 0.13 * self._zoom, round(0.06 * self._zoom)
             draw.line([x - arm, y - arm, x + arm, y + arm], fill=COLLISION, width=width)
             draw.line([x - arm, y + arm, x + arm, y - arm], fill=COLLISION, width=width)
         return np.asarray(image.resize(self._size, Image.Resampling.BOX))
 
     def _pixel(self, position: np.ndarray) -> tuple[float, float]:
         x, y = position
-        return (x + self._columns / 2) * self._scale, (self._rows / 2 - y) * self._scale
+        return (x + self._columns / 2) * self._zoom, (self._rows / 2 - y) * self._zoom
 
     def _disc(
         self, draw: ImageDraw.ImageDraw, position: np.ndarray, radius: float, colour: tuple[int, int, int]
     ) -> None:
         x, y = self._pixel(position)
-        reach = radius * self._scale
-        draw.ellipse([x - reach, y - reach, x + reach, y + reach], fill=colour)
+        half_size = radius * self._zoom
+        draw.ellipse([x - half_size, y - half_size, x + half_size, y + half_size], fill=colour)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""gymnasium-robotics' PointMaze: its maps, its MuJoCo model, and one step of its physics under control."""
+"""gymnasium-robotics' PointMaze: its maps, its MuJoCo model, and one controlled physics step."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-with contextlib.redirect_stderr(io.StringIO()):  # at every import a notice about quite other environments
+with contextlib.redirect_stderr(io.StringIO()):  # the import prints a notice about other environments
     from gymnasium_robotics.envs.maze.maps import LARGE_MAZE, MEDIUM_MAZE, U_MAZE
     from gymnasium_robotics.envs.maze.point_maze import PointMazeEnv
 
@@ -66,18 +66,18 @@ def parse_maze_map(text: str) -> list[list[int]]:
 
 
 def make_point_maze(maze_map: str) -> tuple[PointMazeEnv, mujoco.MjSpec]:
-    """PointMaze for a map, and the specification of its MuJoCo model.
+    """Makes the PointMaze of a map, and the specification of its MuJoCo model.
 
     Args:
         maze_map: As for `parse_maze_map`.
 
     Returns:
-        The environment, and the specification, free to be extended.
+        The environment, and the specification, which the caller may extend.
     """
     env = PointMazeEnv(maze_map=parse_maze_map(maze_map), continuing_task=True, reset_target=False)
     xml = Path(env.tmp_xml_file_path)
     spec = mujoco.MjSpec.from_file(str(xml))
-    xml.unlink()  # PointMaze leaves it behind
+    xml.unlink()  # PointMaze does not delete it
     return env, spec
 
 
@@ -88,16 +88,16 @@ def step_physics(
     target_velocity: Sequence[float] | np.ndarray = (0.0, 0.0),
     force_noise: Sequence[float] | np.ndarray = (0.0, 0.0),
 ) -> None:
-    """One physics step of PointMaze under the PD controller of D4RL's generator.
+    """Runs one physics step of PointMaze with the PD controller of D4RL's generator.
 
     Args:
         model: PointMaze's model.
         data: Its state.
         target: Position x, y to drive to [m].
-        target_velocity: Velocity to have there [m/s]; D4RL's controller uses zero.
+        target_velocity: Wanted velocity at that position [m/s]; D4RL's controller uses zero.
         force_noise: Added to the normalised force before it is clipped to [-1, 1].
     """
-    # Plain numbers: for two coordinates they are several times faster than arrays.
+    # Python floats: for two coordinates they are several times faster than arrays.
     position, velocity = data.qpos.tolist(), data.qvel.tolist()
     for axis in (0, 1):
         speed = min(max(velocity[axis], -MAX_SPEED), MAX_SPEED)

@@ -12,15 +12,15 @@ import numpy as np
 from lerobot_pf2mp.envs.maze.point_maze import BALL_RADIUS
 
 _TALL_WALL = 10.0  # half height [m]
-# MuJoCo's distance between a capsule and a box looks at the capsule's ends: where the whole of a long one crosses the box
-# in the middle, it finds none. Short pieces are measured to within about 1e-5 m.
+# MuJoCo's distance between a capsule and a box uses only the capsule's ends. It finds no contact if a long capsule crosses
+# the box in the middle. Short pieces are measured to within about 1e-5 m.
 _LONGEST_PIECE = 0.25  # [m]
-# MuJoCo's distance to a box is wrong for capsules of no length at all.
+# MuJoCo's distance to a box is wrong for capsules of length zero.
 _SHORTEST_HALF_LENGTH = 1e-5
 
 
 class SweptBall:
-    """The clearance of a ball moved along a straight line, which is a capsule, measured by MuJoCo.
+    """Measures the distance to the walls of a ball that moves along a straight line. MuJoCo models it as a capsule.
 
     Args:
         spec: Specification of a PointMaze model; its walls are the geoms ``block_*``.
@@ -30,7 +30,8 @@ class SweptBall:
     def __init__(self, spec: mujoco.MjSpec, radius: float) -> None:
         for geom in spec.geoms:
             if geom.name.startswith("block_"):
-                geom.size[2] = _TALL_WALL  # so that the way out of a wall is sideways, never over the top
+                # So tall that the shortest path out of a wall is sideways, never over the top.
+                geom.size[2] = _TALL_WALL
         body = spec.worldbody.add_body(name="swept_ball")
         body.add_geom(
             name="swept_ball",
@@ -50,17 +51,16 @@ class SweptBall:
         self._low, self._high = centres - half_sizes, centres + half_sizes  # (walls, 2) corners
         self._border = self._low.min(axis=0), self._high.max(axis=0)
         self._diagonal = float(np.linalg.norm(self._border[1] - self._border[0]))  # no wall is farther [m]
-        self._height = float(
-            self._model.geom_pos[self._walls[0], 2]
-        )  # the walls are prisms: any height will do
+        # The walls are prisms, so any height between their ends is right.
+        self._height = float(self._model.geom_pos[self._walls[0], 2])
         self._radius = radius
 
     def clearance(self, start: np.ndarray, end: np.ndarray) -> float:
-        """The smallest distance between the moving ball and a wall [m]; negative by the depth where it enters one.
+        """The smallest distance between the moving ball and a wall [m]; inside a wall minus the depth.
 
         Args:
-            start: ``(2,)`` position of its centre before [m].
-            end: ``(2,)`` position after [m]; positions beyond the map count as on its border.
+            start: ``(2,)`` position of its centre before the move [m].
+            end: ``(2,)`` position after it [m]. Positions outside the map are clipped to its border.
         """
         start, end = np.clip(start, *self._border), np.clip(end, *self._border)
         n_pieces = math.ceil(math.dist(start, end) / _LONGEST_PIECE)
@@ -71,10 +71,10 @@ class SweptBall:
 
     def _clearance_of_piece(self, start: np.ndarray, end: np.ndarray) -> float:
         low, high = np.minimum(start, end), np.maximum(start, end)
-        # The gap between bounding boxes bounds the distance from below: measure the walls in that order.
+        # The gap between bounding boxes is a lower bound of the distance. The walls are measured in its order.
         gaps = np.maximum(np.maximum(self._low - high, low - self._high), 0.0)  # (walls, 2)
         bounds = np.sqrt((gaps * gaps).sum(axis=1)) - self._radius
-        self._place(start, end)
+        self._set_capsule(start, end)
         smallest = self._diagonal
         for wall in np.argsort(bounds):
             if bounds[wall] >= smallest:
@@ -91,7 +91,8 @@ class SweptBall:
             return True  # the border is wall
         low, high = np.minimum(path[:-1], path[1:]).T, np.maximum(path[:-1], path[1:]).T  # (2, N - 1)
         gaps = np.maximum(self._low.T[..., None] - high[:, None], low[:, None] - self._high.T[..., None])
-        gaps = np.maximum(*gaps)  # (walls, N - 1), a lower bound of the distance to the centre's way
+        # A lower bound of the distance to the path of the ball's centre.
+        gaps = np.maximum(*gaps)  # (walls, N - 1)
         close = np.flatnonzero((gaps < self._radius).any(axis=0))
         return any(self.clearance(path[i], path[i + 1]) < 0 for i in close)
 
@@ -99,7 +100,7 @@ class SweptBall:
         """The smallest clearance along a polyline ``(N, 2)`` of positions [m], N >= 2."""
         return min(self.clearance(start, end) for start, end in pairwise(path))
 
-    def _place(self, start: np.ndarray, end: np.ndarray) -> None:
+    def _set_capsule(self, start: np.ndarray, end: np.ndarray) -> None:
         step = end - start
         length = float(np.hypot(*step))
         x, y = step / length if length > 0 else (1.0, 0.0)
