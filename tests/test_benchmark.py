@@ -208,7 +208,7 @@ def test_two_policies_whose_rows_have_one_name_are_an_error_before_anything_is_w
 ) -> None:
     both = {name: checkpoints[name] for name in ("pf2mp", "fmp")}
     with pytest.raises(
-        ValueError, match=r"every policy must have a name of its own, got 'fmp' twice \(guidance none\)"
+        ValueError, match=r"every policy must have its own name, got 'fmp' twice \(guidance none\)"
     ):
         run_benchmark(spec_of(both, "none"), tmp_path / "benchmark")
     assert not list(tmp_path.iterdir())
@@ -345,7 +345,7 @@ def test_task_and_seed_in_a_path_stand_for_the_task_and_the_training_seed(
     assert [(row.task, row.seed, row.checkpoint) for row in rows] == [
         (task, seed, f"{tmp_path}/{task}/seed_{seed}") for task in tasks for seed in seeds for _ in range(2)
     ]
-    # All four differ in maze or weights, and so in the ways they take.
+    # All four differ in maze or weights, and so in their trajectories.
     assert len({row.path_length_m for row in rows}) == len(rows)
 
 

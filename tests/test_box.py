@@ -80,7 +80,7 @@ def test_a_box_grown_by_a_point_stays_as_it_is() -> None:
 
 
 @pytest.mark.parametrize("length", [0.05, 0.5, 3.0])
-def test_a_way_is_blocked_where_a_point_of_it_is_inside(length: float) -> None:
+def test_a_path_is_blocked_where_a_point_of_it_is_inside(length: float) -> None:
     rng = np.random.default_rng(0)
     answers, n_undecided = [], 0
     for _ in range(200):
@@ -101,7 +101,7 @@ def test_a_way_is_blocked_where_a_point_of_it_is_inside(length: float) -> None:
 
 
 @pytest.mark.parametrize("n_flat", [1, 2])
-def test_ways_along_the_axes_are_blocked_where_a_point_of_them_is_inside(n_flat: int) -> None:
+def test_paths_along_the_axes_are_blocked_where_a_point_of_them_is_inside(n_flat: int) -> None:
     rng = np.random.default_rng(0)
     answers = []
     for _ in range(200):
@@ -115,7 +115,7 @@ def test_ways_along_the_axes_are_blocked_where_a_point_of_them_is_inside(n_flat:
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_a_way_through_the_middle_is_blocked_and_one_that_ends_before_the_box_is_not(axis: int) -> None:
+def test_a_path_through_the_middle_is_blocked_and_one_that_ends_before_the_box_is_not(axis: int) -> None:
     before, inside, behind = (np.array(MIDDLE) for _ in range(3))
     before[axis], behind[axis] = BOX.low[axis] - 1, BOX.high[axis] + 1
     assert BOX.blocks(before, behind)
@@ -125,7 +125,7 @@ def test_a_way_through_the_middle_is_blocked_and_one_that_ends_before_the_box_is
     assert not BOX.blocks(behind, behind + (behind - before))
 
 
-def test_a_way_of_length_zero_is_blocked_inside_only() -> None:
+def test_a_path_of_length_zero_is_blocked_inside_only() -> None:
     for point, blocked in [(MIDDLE, True), ((0.0, 0.0, 3.1), False), ((1.0, 0.0, 1.5), False)]:
         assert BOX.blocks(np.array(point), np.array(point)) == blocked
     rng = np.random.default_rng(0)

@@ -104,7 +104,7 @@ def test_unknown_options_end_with_the_usage_and_nothing_written(tmp_path: Path) 
                 "by default 4000 for a maze, 1000 for Fetch",
                 "handwriting_joint or handwriting_pen.",
                 "x, y of the wall's centre [m]",
-                "Width of these pictures, for a maze their longer side [pixels]",
+                "Width of these images, for a maze their longer side [pixels]",
             ],
         ),
         ("pf2mp-convert", [*MAZES, "by default local/TASK", "by default 80 for a maze, 48 for Fetch"]),

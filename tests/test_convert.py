@@ -77,7 +77,7 @@ def test_timeouts_part_trajectories_with_one_goal_and_rounding_does_not(tmp_path
 def test_d4rl_files_give_back_the_same_whatever_slices_they_are_read_in(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, timeouts: bool, n_rows: int
 ) -> None:
-    # Ways that end in the middle of a slice, with it and with the next one's first row, and ways through several.
+    # Trajectories that end in a slice's middle, at its end, in the next one's first row, and that span several.
     lengths = [6, 2, 9, 20, 19, 1, 0, 30, 6]
     goals = [(1.0, 1.0)] if timeouts else [(1.0, 1.0), (-1.0, 1.0)]
     expected = [line((0, 1), goals[number % len(goals)], n_steps) for number, n_steps in enumerate(lengths)]

@@ -586,7 +586,7 @@ def test_collisions_of_the_expert_are_counted_among_those_left_out(tmp_path: Pat
     assert dropped["in collision"] >= 1
 
 
-def test_ways_that_cut_a_corner_when_resampled_are_left_out(tmp_path: Path) -> None:
+def test_paths_that_cut_a_corner_when_resampled_are_left_out(tmp_path: Path) -> None:
     # Collision-free at full resolution, through the block in the middle with two steps.
     corners = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0], [1.0, -1.0]])
     around = Trajectory(resample(corners, 300), corners[-1])

@@ -50,7 +50,7 @@ STATS = {
 OTHER_STATS = {**STATS, ACTION: {"min": -3 * torch.ones(ACTION_DIM), "max": 3 * torch.ones(ACTION_DIM)}}
 SCHEDULERS = ("DDIM", "DDPM")
 BANDWIDTH = 0.3
-SCALE = 0.3 * 5 * BANDWIDTH**2  # in each of 5 steps, euler goes 0.3 of the way to the local mean
+SCALE = 0.3 * 5 * BANDWIDTH**2  # in each of 5 steps, euler goes 0.3 of the offset to the local mean
 
 every_scheduler = pytest.mark.parametrize("scheduler", SCHEDULERS)
 every_number_of_steps = pytest.mark.parametrize("n_steps", [1, 5, 7, None])
@@ -165,9 +165,8 @@ def test_selected_actions_with_guidance_scale_zero_are_bit_for_bit_those_of_the_
         num_inference_steps=n_steps,
         guidance_scale=0.0,
     )
-    stream = [
-        observations(policy, window=False) for _ in range(6)
-    ]  # a chunk of four actions, and a second one
+    # A chunk of four actions, and a second one.
+    stream = [observations(policy, window=False) for _ in range(6)]
     selected = []
     for one in (policy, stock(policy)):
         torch.manual_seed(1)

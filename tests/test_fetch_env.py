@@ -43,6 +43,7 @@ from lerobot_pf2mp.envs.tasks import FETCH_TASKS
 from lerobot_pf2mp.errors import ConfigError
 
 TASKS = ("reach", "push")
+# As near as a gripper may start [m].
 NEAR_THE_WALL = (
     (1.226, 0.656, 0.457),
     (1.290, 0.656, 0.506),
@@ -50,7 +51,7 @@ NEAR_THE_WALL = (
     (1.426, 0.656, 0.421),
     (1.210, 0.704, 0.560),
     (1.266, 0.704, 0.567),
-)  # as near as a gripper may start [m]
+)
 LOW_WALL = (0.16, 0.04, 0.05)  # its top is below the hand of a gripper that pushes [m]
 FREE = {"start": (1.30, 0.60, 0.50), "goal": (1.30, 0.90, 0.50)}
 PAST_THE_WALL = {"start": (1.15, 1.01, 0.50), "block": (1.15, 0.90), "goal": (1.15, 0.60, 0.425)}
@@ -259,7 +260,7 @@ def assert_same(first: list[tuple], second: list[tuple]) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
 def test_the_same_seed_gives_the_same_rollout_and_another_seed_another(env: FetchEnv, task: str) -> None:
-    # A new environment, one that has been used, and one that takes pictures on the way.
+    # A new environment, one that has been used, and one that renders images between the steps.
     new, camera = FetchEnv(task), FetchEnv(task, render_mode="rgb_array", render_size=32)
     first = rolled_out(new, 3)
     assert_same(first, rolled_out(env, 3))
@@ -355,14 +356,14 @@ def test_reset_draws_anew_what_the_options_leave_out(reach: FetchEnv, name: str)
 )
 def test_starts_and_goals_out_of_reach_are_refused(reach: FetchEnv, name: str, place: tuple) -> None:
     with pytest.raises(
-        ValueError, match=rf"{name} must be a place x, y, z in the gripper's reach, .* got \("
+        ValueError, match=rf"{name} must be a position x, y, z in the gripper's workspace, .* got \("
     ):
         reach.reset(options={name: place})
 
 
 @pytest.mark.parametrize("block", [(1.15,), (1.0, 0.9), (1.15, np.inf), (1.15, 0.9, 0.1)], ids=str)
 def test_blocks_out_of_reach_are_refused(push: FetchEnv, block: tuple) -> None:
-    with pytest.raises(ValueError, match=r"block must be a place .* got \("):
+    with pytest.raises(ValueError, match=r"block must be a position .* got \("):
         push.reset(options={**PAST_THE_WALL, "block": block})
 
 
@@ -383,7 +384,7 @@ def test_a_block_for_reach_is_refused(reach: FetchEnv) -> None:
     ],
     ids=str,
 )
-def test_places_at_the_wall_are_refused(env: FetchEnv, task: str, options: dict) -> None:
+def test_positions_at_the_wall_are_refused(env: FetchEnv, task: str, options: dict) -> None:
     with pytest.raises(ValueError, match="must be clear of the wall"):
         env.reset(seed=0, options=options)
 
@@ -611,7 +612,7 @@ def test_a_touch_in_the_last_physics_step_is_a_collision(reach: FetchEnv) -> Non
 
 @dataclass
 class Measured:
-    """Clearances of one way, as reported and as they are [m]."""
+    """Clearances of one path, as reported and as they are [m]."""
 
     reported: np.ndarray
     exact: np.ndarray
@@ -651,7 +652,7 @@ def test_the_clearance_is_mostly_the_exact_distance(clearances: Measured) -> Non
     assert np.median(np.abs(clearances.reported - clearances.exact)) < 1e-4
 
 
-def test_the_clearance_is_never_zero_on_a_clear_way(reach: FetchEnv) -> None:
+def test_the_clearance_is_never_zero_on_a_clear_path(reach: FetchEnv) -> None:
     reach.reset(seed=0, options=FREE)
     above = between((1.30, 0.60, 0.70), (1.30, 0.90, 0.70), 0.01)
     beside = between((1.10, 0.60, 0.70), (1.10, 0.90, 0.70), 0.01)
@@ -752,7 +753,7 @@ def test_an_episode_ends_at_the_goal_on_request(terminate_on_success: bool) -> N
     env.close()
 
 
-def test_the_path_length_is_that_of_the_grippers_way(push: FetchEnv) -> None:
+def test_the_path_length_is_that_of_the_grippers_path(push: FetchEnv) -> None:
     rng = np.random.default_rng(0)
     for _ in range(2):  # a second episode begins at zero again
         before, info = push.reset(seed=0, options=PAST_THE_WALL)
@@ -787,7 +788,10 @@ def test_the_path_of_many_inner_steps_has_its_bends(patient: FetchEnv) -> None:
         ({"render_mode": "human"}, "render_mode must be None or one of .*rgb_array.* got 'human'"),
         ({"wall_size": (0.3, 0.04, 0.5)}, "wall must be at most 0.32 m high"),
         ({"block_range": ((1.1, 0.84), (1.5, 0.94))}, "block_range is for push only"),
-        ({"start_range": ((1.2, 0.5, 0.5), (1.3, 0.6, 0.9))}, "start_range must be in the gripper's reach"),
+        (
+            {"start_range": ((1.2, 0.5, 0.5), (1.3, 0.6, 0.9))},
+            "start_range must be in the gripper's workspace",
+        ),
     ],
     ids=str,
 )
@@ -836,7 +840,7 @@ def camera() -> Iterator[FetchEnv]:
     env.close()
 
 
-def test_pictures_show_the_wall_the_robot_and_the_goal(camera: FetchEnv) -> None:
+def test_images_show_the_wall_the_robot_and_the_goal(camera: FetchEnv) -> None:
     camera.reset(seed=0, options=FREE)
     at_start = camera.render()
     assert at_start.shape == (360, 480, 3)
@@ -852,7 +856,7 @@ def test_pictures_show_the_wall_the_robot_and_the_goal(camera: FetchEnv) -> None
     np.testing.assert_array_equal(camera.render(), at_start)
 
 
-def test_a_smaller_wall_is_a_smaller_part_of_the_picture(camera: FetchEnv) -> None:
+def test_a_smaller_wall_is_a_smaller_part_of_the_image(camera: FetchEnv) -> None:
     env = FetchEnv("reach", wall_size=(0.30, 0.04, 0.05), render_mode="rgb_array")
     camera.reset(seed=0, options=FREE)
     env.reset(seed=0, options=FREE)
@@ -860,7 +864,7 @@ def test_a_smaller_wall_is_a_smaller_part_of_the_picture(camera: FetchEnv) -> No
     env.close()
 
 
-def test_pictures_show_the_block() -> None:
+def test_images_show_the_block() -> None:
     env = FetchEnv("push", render_mode="rgb_array", render_size=240)
     env.reset(seed=0, options=PAST_THE_WALL)
     there = env.render()
@@ -870,7 +874,7 @@ def test_pictures_show_the_block() -> None:
 
 
 @pytest.mark.parametrize(("size", "shape"), [(32, (24, 32, 3)), (127, (96, 126, 3)), (640, (480, 640, 3))])
-def test_pictures_have_even_sides(size: int, shape: tuple[int, int, int]) -> None:
+def test_images_have_even_sides(size: int, shape: tuple[int, int, int]) -> None:
     env = FetchEnv("reach", render_mode="rgb_array", render_size=size)
     env.reset(seed=0)
     assert env.render().shape == shape
@@ -878,12 +882,12 @@ def test_pictures_have_even_sides(size: int, shape: tuple[int, int, int]) -> Non
     env.close()  # twice is as good
 
 
-def test_without_a_render_mode_there_is_no_picture(reach: FetchEnv) -> None:
+def test_without_a_render_mode_there_is_no_image(reach: FetchEnv) -> None:
     reach.reset(seed=0)
     assert reach.render() is None
 
 
-def test_a_picture_before_the_first_reset_is_refused() -> None:
+def test_an_image_before_the_first_reset_is_refused() -> None:
     env = FetchEnv("reach", render_mode="rgb_array", render_size=32)
     try:
         with pytest.raises(gym.error.ResetNeeded, match="reset"):
@@ -1042,7 +1046,7 @@ def test_a_task_that_does_not_exist_is_refused(task: str | None) -> None:
     [
         ({"wall_size": (0.3, 0.04, 0.5)}, "wall must be at most 0.32 m high"),
         ({"wall_position": (0.3, 0.04)}, "a wall must stand on the table"),
-        ({"goal_range": ((1.2, 0.74, 0.45), (1.3, 0.76, 0.5))}, "must leave places clear of the wall"),
+        ({"goal_range": ((1.2, 0.74, 0.45), (1.3, 0.76, 0.5))}, "must leave positions clear of the wall"),
         ({"block_range": ((1.1, 0.84), (1.5, 0.94))}, "block_range is for push only"),
         (
             {"task": "FetchPushWall-v0", "goal_range": ((1.2, 0.5, 0.4),) * 2},

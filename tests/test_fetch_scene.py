@@ -82,7 +82,7 @@ def test_only_push_has_a_block_and_its_wall_is_lower() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("task", "share"), [("reach", 0.86), ("push", 0.91)])
-def test_most_straight_ways_are_blocked(task: str, share: float) -> None:
+def test_most_straight_lines_are_blocked(task: str, share: float) -> None:
     scene = FETCH_SCENES[task]
     blocked = [scene.is_blocked(layout) for layout in layouts(task)]
     assert np.mean(blocked) == pytest.approx(share, abs=0.04)
@@ -102,7 +102,7 @@ def test_the_same_generator_gives_the_same_layouts(task: str) -> None:
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_places_fill_their_ranges(task: str) -> None:
+def test_positions_fill_their_ranges(task: str) -> None:
     scene = FETCH_SCENES[task]
     drawn = layouts(task)
     ranges = {"start": scene.start_range, "goal": scene.goal_range, "block": scene.block_range}
@@ -152,7 +152,7 @@ def test_blocks_can_be_pushed_to_their_goals_in_a_straight_line() -> None:
 
 @pytest.mark.parametrize("margin", [0.0, 0.02])
 @pytest.mark.parametrize("task", TASKS)
-def test_a_straight_way_hits_the_wall_where_hand_or_fingers_overlap_it(task: str, margin: float) -> None:
+def test_a_straight_line_hits_the_wall_where_hand_or_fingers_overlap_it(task: str, margin: float) -> None:
     scene = FETCH_SCENES[task]
     rng = np.random.default_rng(0)
     answers = []
@@ -163,7 +163,7 @@ def test_a_straight_way_hits_the_wall_where_hand_or_fingers_overlap_it(task: str
         way = points_between(start, end)
         if gripper_touches(scene.wall, way, margin):
             assert hits
-        elif hits:  # between two points of the way
+        elif hits:  # between two points of the path
             assert gripper_touches(scene.wall, way, margin + 0.001)
     assert 40 < sum(answers) < 360
 
@@ -178,7 +178,7 @@ def test_the_hand_hits_a_high_wall_that_the_fingers_pass_beside() -> None:
     assert low.hits_wall(start - [0.02, 0, 0], end - [0.02, 0, 0])
 
 
-def test_a_way_to_push_is_blocked_on_either_of_its_two_parts() -> None:
+def test_a_path_to_push_is_blocked_on_either_of_its_two_parts() -> None:
     scene = FETCH_SCENES["push"]
     here, there, far = (1.30, 0.55, 0.45), (1.30, 0.95, 0.425), (1.50, 0.95, 0.425)
     beside = (1.50, 0.55, 0.425)
@@ -204,13 +204,13 @@ def test_changes_replace_the_defaults_and_none_leaves_them() -> None:
     assert scene.goal_range == FETCH_SCENES["reach"].goal_range
 
 
-def test_a_range_may_be_a_single_place() -> None:
+def test_a_range_may_be_a_single_position() -> None:
     place = (1.25, 0.55, 0.5)
     scene = make_scene("reach", start_range=(place, place))
     np.testing.assert_array_equal(scene.sample(np.random.default_rng(3)).start, place)
 
 
-def test_places_in_the_wall_are_left_out_of_a_range() -> None:
+def test_positions_in_the_wall_are_left_out_of_a_range() -> None:
     scene = make_scene("reach", start_range=((1.10, 0.50, 0.45), (1.50, 1.00, 0.60)))
     rng = np.random.default_rng(0)
     starts = np.array([scene.sample(rng).start for _ in range(100)])
@@ -277,7 +277,7 @@ def test_ranges_that_are_not_two_ordered_corners_in_reach_are_refused(task: str,
         for corner, outside in enumerate((WORKSPACE.low[axis] - 0.01, WORKSPACE.high[axis] + 0.01)):
             corners = np.array([low, high])
             corners[corner, axis] = outside
-            with pytest.raises(ValueError, match=f"{name} must be in the gripper's reach, from .* got"):
+            with pytest.raises(ValueError, match=f"{name} must be in the gripper's workspace, from .* got"):
                 make_scene(task, **{name: corners})
 
 
@@ -300,7 +300,7 @@ def test_ranges_that_are_not_two_ordered_corners_in_reach_are_refused(task: str,
 )
 def test_scenes_without_a_free_layout_are_refused(task: str, changes: dict) -> None:
     with pytest.raises(
-        ValueError, match="must leave places clear of the wall.*none found in 1000 tries with"
+        ValueError, match="must leave positions clear of the wall.*none found in 1000 tries with"
     ):
         make_scene(task, **changes)
 

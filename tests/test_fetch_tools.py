@@ -91,7 +91,7 @@ def dense(way: np.ndarray, n: int = 51) -> np.ndarray:
 
 
 def shortest_above(start: np.ndarray, goal: np.ndarray, boxes: Sequence[Box]) -> float:
-    """The length of the shortest way in the vertical plane through both ends: by way of points at the boxes' edges."""
+    """The length of the shortest path in the vertical plane through both ends, via points at the boxes' edges."""
     nodes = [start, goal]
     for box in boxes:
         for side, axis in itertools.product((box.low, box.high), (0, 1)):
@@ -159,7 +159,7 @@ def test_no_route_is_longer_than_the_shortest_one_above() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("margin", [0.0, 0.02, 0.05])
 @pytest.mark.parametrize("task", TASKS)
-def test_routes_past_the_walls_of_the_tasks_are_at_most_twice_the_straight_way(
+def test_routes_past_the_walls_of_the_tasks_are_at_most_twice_the_straight_line(
     task: str, margin: float
 ) -> None:
     scene, rng = FETCH_SCENES[task], np.random.default_rng(0)
@@ -197,7 +197,7 @@ def test_a_corner_that_is_no_detour_is_left_out() -> None:
     np.testing.assert_allclose(way[:, :2], [[0.5, 0.0], [0.4, 0.4], [0.3, 1.0]], atol=1e-12)
 
 
-def test_the_length_of_a_way_is_the_sum_of_its_parts() -> None:
+def test_the_length_of_a_path_is_the_sum_of_its_parts() -> None:
     assert length(np.array([[0.0, 0, 0], [3, 4, 0], [3, 4, 2]])) == pytest.approx(7)
     assert length(np.zeros((1, 3))) == 0
 
@@ -211,7 +211,7 @@ def test_walking_takes_equal_steps_of_at_most_the_given_length_to_the_end(step: 
     points = walk(way, step)
     np.testing.assert_allclose(points[-1], way[-1], atol=1e-12)
     assert len(points) == math.ceil(length(way) / step)
-    # Along the way: put the corners between the points, in the order in which they come.
+    # Along the path: put the corners between the points, in the order in which they come.
     at_corner = np.linalg.norm(np.diff(way, axis=0), axis=1).cumsum()
     at_point = length(way) / len(points) * np.arange(1, len(points) + 1)
     order = np.argsort(np.r_[at_corner, at_point], kind="stable")
@@ -222,7 +222,7 @@ def test_walking_takes_equal_steps_of_at_most_the_given_length_to_the_end(step: 
     )
 
 
-def test_walking_a_straight_way_takes_equal_steps() -> None:
+def test_walking_a_straight_line_takes_equal_steps() -> None:
     points = walk(np.array([[0.0, 0, 0], [0.0, 0.3, 0.4]]), 0.12)
     np.testing.assert_allclose(points, np.linspace([0, 0, 0], [0, 0.3, 0.4], 6)[1:], atol=1e-12)
 
@@ -627,7 +627,7 @@ def assert_holds(root: Path, recordings: Sequence[Recording], n_steps: int = 48)
             np.testing.assert_allclose(frames[key][number], values, rtol=0, atol=1e-6)
 
 
-# Ways of the gripper that need no simulation: beside the wall, through it, and beside it to a place that is not the goal.
+# Trajectories of the gripper without simulation: beside the wall, through it, and beside it but not to the goal.
 BESIDE = gliding((1.20, 0.50, 0.50), (1.40, 0.60, 0.55))
 ABOVE = gliding((1.30, 0.50, 0.72), (1.30, 0.95, 0.72), 55)
 THROUGH = gliding((1.30, 0.55, 0.45), (1.30, 0.95, 0.45))
@@ -665,7 +665,9 @@ def test_recordings_of_others_become_what_the_collector_writes(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
-def test_episodes_in_which_the_robot_waits_at_the_goal_keep_their_way(tmp_path: Path, task: str) -> None:
+def test_episodes_in_which_the_robot_waits_at_the_goal_keep_their_trajectory(
+    tmp_path: Path, task: str
+) -> None:
     good = [r for r in demonstrations(task, "clear") if r.is_success and not r.is_collision][:10]
     path = write_npz(tmp_path / "others.npz", episodes_of_one_length(good))
     assert convert(path, task, tmp_path / "d") == (10, {})
@@ -793,7 +795,7 @@ def test_episodes_that_are_no_good_are_left_out_and_counted(tmp_path: Path) -> N
     assert_holds(tmp_path / "d", [BESIDE, NEARLY])
 
 
-def test_ways_are_checked_between_resampled_positions(tmp_path: Path) -> None:
+def test_paths_are_checked_between_resampled_positions(tmp_path: Path) -> None:
     corners = [(1.30, 0.62, 0.42), (1.30, 0.62, 0.63), (1.30, 0.88, 0.63), (1.30, 0.88, 0.42)]
     parts = [np.linspace(a, b, 20, endpoint=False) for a, b in itertools.pairwise(corners)]
     around = Recording(np.array(corners[-1]), list(np.concatenate([*parts, corners[-1:]])))

@@ -188,22 +188,22 @@ def test_every_figure_is_drawn_of_what_it_is_called(
 
 
 @pytest.mark.slow
-def test_a_film_shows_every_step_of_the_episode_and_the_same_one_twice(checkpoint: str) -> None:
+def test_a_video_shows_every_step_of_the_episode_and_the_same_one_twice(checkpoint: str) -> None:
     figures = figures_of(checkpoint)
     pair = figures.path_pairs(1, [1])[0]
     assert pair.n_side_by_side == 2
-    unguided, guided = figures.film(pair)
+    unguided, guided = figures.video_frames(pair)
     assert (
         (len(unguided), len(guided)) == (len(pair.unguided.positions), len(pair.guided.positions)) == (7, 7)
     )
     np.testing.assert_array_equal(unguided[0], guided[0])
     assert not np.array_equal(unguided[-1], guided[-1])
-    again, _ = figures.film(figures.path_pairs(1, [1])[0])
+    again, _ = figures.video_frames(figures.path_pairs(1, [1])[0])
     np.testing.assert_array_equal(unguided[-1], again[-1])
 
 
 @pytest.mark.slow
-def test_fetch_is_drawn_with_its_wall_and_its_block_is_no_part_of_the_way(tmp_path: Path) -> None:
+def test_fetch_is_drawn_with_its_wall_and_its_block_is_no_part_of_the_trajectory(tmp_path: Path) -> None:
     env = PF2MPFetchEnv(task="FetchPushWall-v0", episode_length=3)
     figures = figures_of(write_fetch_checkpoint(tmp_path / "policy"), env)
     assert [box.size for box in figures.scene().obstacles] == [(0.16, 0.04, 0.10)]

@@ -111,8 +111,8 @@ def exact_bar(envs: dict) -> HandwritingEnv:
 
 
 def actions_of(env: HandwritingEnv, places: np.ndarray) -> np.ndarray:
-    """What moves the pen to ``(N, 2)`` places: themselves, or joint positions."""
-    return places if env.action_space.shape == (2,) else env.kinematics.way(places)
+    """The actions that move the pen to ``(N, 2)`` positions: these, or joint positions."""
+    return places if env.action_space.shape == (2,) else env.kinematics.joint_trajectory(places)
 
 
 def tip_of(env: HandwritingEnv, observation: dict[str, np.ndarray]) -> np.ndarray:
@@ -122,7 +122,7 @@ def tip_of(env: HandwritingEnv, observation: dict[str, np.ndarray]) -> np.ndarra
 
 
 def draw(env: HandwritingEnv, places: np.ndarray) -> list[tuple]:
-    """Draws the line through ``(N, 2)`` places, from the first of them."""
+    """Draws the line through ``(N, 2)`` positions, from the first of them."""
     env.reset(seed=0, options={"start": places[0]})
     return [env.step(action) for action in actions_of(env, places)[1:]]
 
@@ -132,7 +132,7 @@ def draw_letter(env: HandwritingEnv, n_steps: int) -> list[tuple]:
 
 
 def points_along(line: np.ndarray, n: int) -> np.ndarray:
-    """``(n, 2)`` places at equal distances along a line ``(N, 2)``."""
+    """``(n, 2)`` positions at equal distances along a line ``(N, 2)``."""
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     at = np.linspace(0.0, length[-1], n)
     return np.stack([np.interp(at, length, line[:, axis]) for axis in (0, 1)], axis=1)
@@ -233,7 +233,7 @@ def test_the_row_of_joints_beyond_their_limits_is_named(exact: HandwritingEnv) -
 
 
 @pytest.mark.parametrize("height", [-0.03, 0.0, 0.05])
-def test_joints_for_a_place_hold_the_pen_there_upright(exact: HandwritingEnv, height: float) -> None:
+def test_joints_for_a_position_hold_the_pen_there_upright(exact: HandwritingEnv, height: float) -> None:
     data = mujoco.MjData(exact._model)
     for place in itertools.product(np.linspace(LOW[0], HIGH[0], 5), np.linspace(LOW[1], HIGH[1], 5)):
         joints = exact.kinematics.joints(np.array(place), height=height)
@@ -245,7 +245,7 @@ def test_joints_for_a_place_hold_the_pen_there_upright(exact: HandwritingEnv, he
         np.testing.assert_allclose(data.site("pen_tip").xmat[[2, 5, 8]], [0, 0, -1], atol=1e-4)
 
 
-def test_joints_for_a_place_are_those_next_to_home(exact: HandwritingEnv) -> None:
+def test_joints_for_a_position_are_those_next_to_home(exact: HandwritingEnv) -> None:
     # The way to them from home has no part along which the arm can move and the pen stay.
     data, jacobian = mujoco.MjData(exact._model), np.zeros((6, N_JOINTS))
     for place in itertools.product((LOW[0], 0.5, HIGH[0]), (LOW[1], 0.06, HIGH[1])):
@@ -258,7 +258,7 @@ def test_joints_for_a_place_are_those_next_to_home(exact: HandwritingEnv) -> Non
         assert np.abs(jacobian[:, :7] @ free).max() < 1e-9
 
 
-def test_joints_for_a_place_do_not_depend_on_what_was_asked_before(exact: HandwritingEnv) -> None:
+def test_joints_for_a_position_do_not_depend_on_what_was_asked_before(exact: HandwritingEnv) -> None:
     rng = np.random.default_rng(0)
     for _ in range(30):
         place = rng.uniform(LOW, HIGH)
@@ -270,13 +270,13 @@ def test_joints_for_a_place_do_not_depend_on_what_was_asked_before(exact: Handwr
 @pytest.mark.parametrize(
     ("place", "height"), [((1.2, 0.0), 0.0), ((0.05, 0.0), 0.0), ((0.5, 0.0), 1.5)], ids=str
 )
-def test_places_out_of_reach_are_refused(exact: HandwritingEnv, place: tuple, height: float) -> None:
-    message = re.escape(f"the arm must reach the pen's place x, y [m], got {list(place)}")
+def test_positions_out_of_reach_are_refused(exact: HandwritingEnv, place: tuple, height: float) -> None:
+    message = re.escape(f"the arm must reach the pen's position x, y [m], got {list(place)}")
     with pytest.raises(ValueError, match=message):
         exact.kinematics.joints(np.array(place), height=height)
     if height == 0:
         with pytest.raises(ValueError, match=message):
-            exact.kinematics.way(np.array([SHEET_CENTRE, place]))
+            exact.kinematics.joint_trajectory(np.array([SHEET_CENTRE, place]))
 
 
 @pytest.mark.parametrize("letter", LETTERS)
@@ -284,7 +284,7 @@ def test_the_arm_draws_every_letter_smoothly_and_within_its_limits(
     exact: HandwritingEnv, letter: str
 ) -> None:
     places = evenly_spaced(make_writing_scene(letter, n_regions=0).stroke, 0.005)
-    joints = exact.kinematics.way(places)
+    joints = exact.kinematics.joint_trajectory(places)
     low, high = exact._model.jnt_range.T
     assert np.minimum(joints - low, high - joints)[:, :7].min() > 0.3
     assert np.abs(np.diff(joints, axis=0)).max() < 0.025
@@ -299,7 +299,7 @@ def scene_with(stroke: np.ndarray, *regions: Disc) -> WritingScene:
 
 
 def on_paper(places: np.ndarray, height: float = 0.0) -> np.ndarray:
-    """``(N, 3)`` positions of the pen above ``(N, 2)`` places."""
+    """``(N, 3)`` positions of the pen above ``(N, 2)`` positions on the sheet."""
     return np.c_[places, np.full(len(places), height)]
 
 
@@ -327,7 +327,7 @@ def test_a_pen_pressed_onto_the_table_draws_at_every_depth() -> None:
         assert ink.length == pytest.approx(0.1)
 
 
-def test_a_new_stroke_begins_after_a_lift_and_the_way_between_is_not_drawn() -> None:
+def test_a_new_stroke_begins_after_a_lift_and_the_path_between_is_not_drawn() -> None:
     ink = Ink(scene_with(BAR, DISC))
     tips = np.array(
         [
@@ -343,10 +343,10 @@ def test_a_new_stroke_begins_after_a_lift_and_the_way_between_is_not_drawn() -> 
     assert ink.length == pytest.approx(0.02 + 0.03)
 
 
-def test_a_way_in_several_parts_leaves_the_same_ink_as_in_one() -> None:
+def test_a_path_in_several_parts_leaves_the_same_ink_as_in_one() -> None:
     rng = np.random.default_rng(0)
     tips = np.array([0.45, 0.0, 0.0]) + np.cumsum(rng.normal(0, 0.004, size=(200, 3)), axis=0)
-    tips[:, 2] = 0.02 + 0.02 * np.sin(np.arange(200) / 6)  # down every 38 places
+    tips[:, 2] = 0.02 + 0.02 * np.sin(np.arange(200) / 6)  # down every 38 positions
     whole, parts = Ink(scene_with(BAR, DISC)), Ink(scene_with(BAR, DISC))
     clearance = whole.draw(tips)
     ends = [0, 1, 27, 28, 40, 66, 90, 141, 199]  # some of them while it draws
@@ -528,7 +528,7 @@ def assert_same(first: list[tuple], second: list[tuple]) -> None:
 def test_the_same_seed_gives_the_same_rollout_and_another_seed_another(
     env: HandwritingEnv, space: str, control: str
 ) -> None:
-    # A new environment that takes pictures on the way, and one that has been used.
+    # A new environment that renders images between the steps, and one that has been used.
     new = HandwritingEnv(space, control=control, render_mode="rgb_array", render_size=32)
     first = rolled_out(new, 3, render=True)
     assert_same(first, rolled_out(env, 3))
@@ -552,9 +552,8 @@ def test_episodes_start_on_the_table_beside_the_beginning_of_the_letter(env: Han
         assert info["stroke_error"] == math.inf
         if len(tip) == 3:
             assert tip[2] == pytest.approx(0, abs=1e-4)
-            np.testing.assert_allclose(
-                observation["agent_pos"], env.kinematics.joints(tip[:2]), atol=1e-4
-            )  # upright
+            upright = env.kinematics.joints(tip[:2])
+            np.testing.assert_allclose(observation["agent_pos"], upright, atol=1e-4)
     offsets = np.array(offsets)
     assert START_SPREAD == 0.005
     assert np.abs(offsets).max() <= START_SPREAD + 1e-5
@@ -610,9 +609,9 @@ def test_an_option_that_is_none_is_left_out(exact: HandwritingEnv) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"start": (0.5, np.nan)}, r"start must be finite places x, y \[m\], got"),
-        ({"start": (0.5,)}, r"start must be finite places x, y \[m\], got"),
-        ({"start": (0.5, 0.0, 0.0)}, r"start must be finite places x, y \[m\], got"),
+        ({"start": (0.5, np.nan)}, r"start must be finite positions x, y \[m\], got"),
+        ({"start": (0.5,)}, r"start must be finite positions x, y \[m\], got"),
+        ({"start": (0.5, 0.0, 0.0)}, r"start must be finite positions x, y \[m\], got"),
         ({"start": ((0.5, 0.0), (0.5, 0.1))}, "start must be"),
         ({"start": (0.5, 0.17)}, r"start must lie on the sheet, .* got \[0.5, 0.17\]"),
         ({"joints": HOME[:7]}, r"joints must be 9 finite positions, .* got an array of shape \(7,\)"),
@@ -628,7 +627,7 @@ def test_options_that_are_no_start_are_refused_with_the_rule(
         exact.reset(seed=0, options=options)
 
 
-def test_a_step_or_a_picture_before_the_first_reset_is_refused() -> None:
+def test_a_step_or_an_image_before_the_first_reset_is_refused() -> None:
     env = HandwritingEnv("pen", render_mode="rgb_array", render_size=32)
     with pytest.raises(gym.error.ResetNeeded, match="reset"):
         env.step(np.array(SHEET_CENTRE))
@@ -667,7 +666,7 @@ def test_exact_joints_reach_every_action(exact: HandwritingEnv) -> None:
 
 
 @pytest.mark.slow
-def test_an_exact_pen_reaches_every_place_on_the_sheet_from_every_other(envs: dict) -> None:
+def test_an_exact_pen_reaches_every_position_on_the_sheet_from_every_other(envs: dict) -> None:
     env = envs["pen", "exact", "S"]
     corners = [np.array(corner) for corner in itertools.product(*zip(LOW, HIGH, strict=True))]
     rng = np.random.default_rng(0)
@@ -677,7 +676,7 @@ def test_an_exact_pen_reaches_every_place_on_the_sheet_from_every_other(envs: di
         np.testing.assert_allclose(observation["agent_pos"], place, atol=1e-4)
 
 
-def test_a_pen_reaches_its_place_from_every_posture(envs: dict) -> None:
+def test_a_pen_reaches_its_position_from_every_posture(envs: dict) -> None:
     env = envs["pen", "exact", "S"]
     rng = np.random.default_rng(0)
     for _ in range(5):
@@ -714,7 +713,7 @@ def test_physics_follow_a_slow_stroke_within_a_millimetre(physics: HandwritingEn
 def test_two_steps_at_twice_the_frequency_are_one_step() -> None:
     slow, fast = HandwritingEnv(fps=10), HandwritingEnv(fps=20)
     places = points_along(slow.scene.stroke, 61)[:10]
-    joints = slow.kinematics.way(places)
+    joints = slow.kinematics.joint_trajectory(places)
     for env in (slow, fast):
         env.reset(seed=0, options={"joints": joints[0]})
     for before, after in itertools.pairwise(joints):
@@ -773,7 +772,7 @@ def test_a_region_crossed_between_two_actions_is_a_collision(bar: HandwritingEnv
 
 @pytest.mark.parametrize("control", CONTROLS)
 @pytest.mark.parametrize("space", SPACES)
-def test_a_way_around_a_region_is_no_collision(bar: HandwritingEnv) -> None:
+def test_a_path_around_a_region_is_no_collision(bar: HandwritingEnv) -> None:
     around = np.array([[0.47, 0.0], [0.485, 0.012], [0.5, 0.015], [0.515, 0.012], [0.53, 0.0]])
     steps = draw(bar, points_along(around, 21))
     assert sum(rewards_of(steps)) == 0
@@ -849,7 +848,7 @@ def test_a_wrist_on_the_table_is_a_collision(envs: dict, control: str) -> None:
     assert infos_of(steps)[-1]["path_length"] == 0  # the pen is in the air
 
 
-def test_a_way_through_the_table_collides_though_both_its_ends_are_free(exact: HandwritingEnv) -> None:
+def test_a_path_through_the_table_collides_though_both_its_ends_are_free(exact: HandwritingEnv) -> None:
     start, end = map(posture, THROUGH_THE_TABLE)
     for first, second in ((start, end), (end, start)):
         _, info = exact.reset(options={"joints": first})
@@ -1129,7 +1128,7 @@ def is_blue(picture: np.ndarray) -> np.ndarray:
 
 
 def pixels_of(places: np.ndarray, picture: np.ndarray) -> np.ndarray:
-    """Row and column of ``(N, 2)`` places on the sheet in a picture from the top."""
+    """Row and column of ``(N, 2)`` positions on the sheet in an image from the top."""
     height, width, _ = picture.shape
     scale = height / 2 / (0.42 * math.tan(math.radians(45) / 2))  # [pixels/m]
     across = scale * (np.asarray(places) - SHEET_CENTRE)
@@ -1156,7 +1155,7 @@ def top_camera() -> Iterator[HandwritingEnv]:
 
 
 @pytest.mark.slow
-def test_pictures_show_the_ink_where_it_is_drawn(top_camera: HandwritingEnv) -> None:
+def test_images_show_the_ink_where_it_is_drawn(top_camera: HandwritingEnv) -> None:
     stroke = points_along(top_camera.scene.stroke, 41)
     top_camera.reset(seed=0, options={"start": stroke[0]})
     at_start = top_camera.render()
@@ -1169,14 +1168,14 @@ def test_pictures_show_the_ink_where_it_is_drawn(top_camera: HandwritingEnv) -> 
     assert not any_near(is_blue(half), pixels[22:]).any()
     changed = (half != at_start).any(axis=-1)
     assert is_blue(half)[changed].mean() > 0.6  # its edge is a mixture
-    np.testing.assert_array_equal(top_camera.render(), half)  # taking pictures adds nothing
+    np.testing.assert_array_equal(top_camera.render(), half)  # rendering adds nothing
     draw(top_camera, stroke)
     assert any_near(is_blue(top_camera.render()), pixels[1:]).all()
     top_camera.reset(seed=0, options={"start": stroke[0]})
     np.testing.assert_array_equal(top_camera.render(), at_start)
 
 
-def test_pictures_show_letter_and_regions_where_they_are(bar_file: str, tmp_path: Path) -> None:
+def test_images_show_letter_and_regions_where_they_are(bar_file: str, tmp_path: Path) -> None:
     regions = (Disc((0.47, 0.09), 0.03), Disc((0.60, -0.05), 0.02))
     scene = WritingScene("two", np.array([[0.38, -0.1], [0.38, 0.1], [0.42, 0.1]]), regions)
     env = HandwritingEnv(
@@ -1202,7 +1201,7 @@ def test_pictures_show_letter_and_regions_where_they_are(bar_file: str, tmp_path
 
 
 @pytest.mark.slow
-def test_pictures_from_the_top_leave_out_the_arm_and_from_the_side_show_it(
+def test_images_from_the_top_leave_out_the_arm_and_from_the_side_show_it(
     arm_camera: HandwritingEnv, top_camera: HandwritingEnv
 ) -> None:
     for env, shows_it in ((arm_camera, True), (top_camera, False)):
@@ -1250,7 +1249,7 @@ def test_a_sheet_full_of_strokes_can_be_rendered(top_camera: HandwritingEnv) -> 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("size", "shape"), [(32, (24, 32, 3)), (127, (96, 126, 3)), (800, (600, 800, 3))])
-def test_pictures_have_even_sides(size: int, shape: tuple[int, int, int]) -> None:
+def test_images_have_even_sides(size: int, shape: tuple[int, int, int]) -> None:
     env = HandwritingEnv("pen", control="exact", render_mode="rgb_array", render_size=size, camera="top")
     env.reset(seed=0)
     picture = env.render()
@@ -1261,7 +1260,7 @@ def test_pictures_have_even_sides(size: int, shape: tuple[int, int, int]) -> Non
     env.close()
 
 
-def test_without_a_render_mode_there_is_no_picture(exact: HandwritingEnv) -> None:
+def test_without_a_render_mode_there_is_no_image(exact: HandwritingEnv) -> None:
     exact.reset(seed=0)
     assert exact.render() is None
 

@@ -73,7 +73,7 @@ def demonstrations(space: str) -> list[Trajectory | str]:
 
 
 def kept(space: str) -> list[np.ndarray]:
-    """The ways of the demonstrations that succeeded."""
+    """The trajectories of the demonstrations that succeeded."""
     return [each.positions for each in demonstrations(space) if isinstance(each, Trajectory)]
 
 
@@ -113,7 +113,7 @@ def frames_of(root: Path) -> dict[str, np.ndarray]:
 
 
 def assert_holds(root: Path, ways: Sequence[np.ndarray], atol: float = 1e-6) -> None:
-    """Checks that a dataset's episodes are these ways ``(T + 1, D)``."""
+    """Checks that a dataset's episodes are these trajectories ``(T + 1, D)``."""
     frames = frames_of(root)
     assert len(frames["action"]) == len(ways)
     for states, actions, way in zip(frames["observation.state"], frames["action"], ways, strict=True):
@@ -233,7 +233,7 @@ def test_demonstrations_write_the_letter_without_a_collision_under_both_controls
             assert outcome(env_of(space, control), joints[0], way[1:]) == (True, False)
 
 
-def test_a_way_that_enters_a_region_is_no_demonstration_although_the_arm_cuts_the_corner(
+def test_a_path_that_enters_a_region_is_no_demonstration_although_the_arm_cuts_the_corner(
     tmp_path: Path,
 ) -> None:
     env = env_of("joint")
@@ -250,7 +250,7 @@ def test_a_way_that_enters_a_region_is_no_demonstration_although_the_arm_cuts_th
         assert (result if isinstance(result, str) else None) == expected
 
 
-def test_a_way_from_which_the_arm_strays_into_a_region_is_in_collision(tmp_path: Path) -> None:
+def test_a_path_from_which_the_arm_strays_into_a_region_is_in_collision(tmp_path: Path) -> None:
     env, n_steps = HandwritingEnv("pen", n_regions=0), 12  # so fast that it lags behind
     way = ScriptedHandwritingExpert(env, n_steps, seed=0).demonstrate(0).positions
     drawn = np.concatenate(env.ink.strokes)
@@ -295,7 +295,7 @@ def test_in_demonstrations_the_fingers_hold_the_pen_upright_on_the_table() -> No
         assert np.abs(directions - [0, 0, -1]).max() < 0.01
 
 
-def test_joints_and_places_of_a_demonstration_are_the_same_way_along_the_letter() -> None:
+def test_joints_and_positions_of_a_demonstration_are_the_same_trajectory_along_the_letter() -> None:
     stroke = env_of("pen").scene.stroke
     for joints, places in zip(kept("joint"), kept("pen"), strict=True):
         assert np.abs(places[[0, -1]] - stroke[[0, -1]]).max() <= START_SPREAD + 1e-12
@@ -541,7 +541,7 @@ def in_json(path: Path, *ways: np.ndarray) -> Path:
 
 
 def teleoperated(root: Path, ways: Sequence[np.ndarray], key: str = "action") -> Path:
-    """A LeRobotDataset with these ways ``(T, D)`` as actions."""
+    """A LeRobotDataset with these trajectories ``(T, D)`` as actions."""
     feature = {"dtype": "float32", "shape": (ways[0].shape[1],), "names": None}
     frames = [{key: way.astype(np.float32)} for way in ways]
     write_dataset(root, DatasetSpec("local/arm", 10, {key: feature}, "Write.", ""), frames)
@@ -646,7 +646,7 @@ def joints_at(places: Sequence[Sequence[float]], height: float = 0.0) -> np.ndar
 
 @pytest.mark.slow
 @pytest.mark.parametrize("recorded", SPACES)
-def test_joints_and_places_of_the_pen_become_each_other(tmp_path: Path, recorded: str) -> None:
+def test_joints_and_positions_of_the_pen_become_each_other(tmp_path: Path, recorded: str) -> None:
     ways = kept(recorded)[:2]
     path = in_json(tmp_path / "strokes.json", *ways)
     for space in SPACES:
@@ -711,7 +711,7 @@ def test_recordings_that_enter_a_region_or_lift_the_pen_are_left_out_and_counted
     assert_holds(tmp_path / "d", kept("pen")[:2], atol=1e-5)
 
 
-def test_a_region_between_two_resampled_places_is_entered(tmp_path: Path) -> None:
+def test_a_region_between_two_resampled_positions_is_entered(tmp_path: Path) -> None:
     disc = {"centre": [0.5, 0.0], "radius": 0.005}
     scene = write_json(tmp_path / "scene.json", {"stroke": STRAIGHT, "regions": [disc]})
     through = np.array([[0.47, 0.0], [0.49, 0.0], [0.51, 0.0], [0.53, 0.0]])

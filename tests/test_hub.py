@@ -895,7 +895,7 @@ def test_a_dataset_is_not_made_if_it_cannot_be_published(tmp_path, refused):
         assert "user/umaze cannot be published: " in refused(
             *command, "--push_to_hub=true", "--repo_id=user/umaze"
         )
-        assert "--push_to_hub=true asks for" in refused(*command, "--private=true")
+        assert "--private needs --push_to_hub=true" in refused(*command, "--private=true")
     assert not root.exists()
 
 

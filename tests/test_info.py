@@ -154,7 +154,7 @@ def test_without_a_screen_glfw_does_not_render_which_is_said_and_is_not_essentia
     assert verdict == "No problem found."
     assert [row.split("  ")[0] for row in rows if "  ok" not in row and "  optional: " not in row] == []
     (rendering,) = (row for row in rows if row.startswith("rendering"))
-    assert "no pictures of Fetch and handwriting" in rendering
+    assert "no images of Fetch and handwriting" in rendering
     assert "optional: try without MUJOCO_GL: RuntimeError: rendering without a screen needs EGL" in rendering
 
 
@@ -286,10 +286,8 @@ def test_versions_outside_of_what_is_asked_for_are_problems(site_packages: Path)
         "mujoco": ("3.12.0", 'pip install "mujoco<3.12,>=3.3"'),
         "lerobot": ("0.7.0", 'pip install "lerobot<0.7,>=0.6.1"'),
         "numpy": ("2.3.0", 'pip install "numpy<2.3.0,>=2.0.0"'),  # LeRobot asks for it
-        "accelerate": (
-            "1.13.9",
-            'pip install "accelerate<2.0.0,>=1.14.0"',
-        ),  # and with an extra of an extra for this
+        # LeRobot asks for this with an extra of an extra.
+        "accelerate": ("1.13.9", 'pip install "accelerate<2.0.0,>=1.14.0"'),
         "mink": ("not installed", 'pip install "mink>=1.1"'),
     }
     assert (lines["experts"]["value"], lines["experts"]["status"]) == ("stable-baselines3 3.0.0", "optional")

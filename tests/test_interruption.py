@@ -76,7 +76,7 @@ def test_sigterm_ends_training_in_one_line(
         cli.train()
     assert exit_.value.code == TERMINATED
     (line,) = capsys.readouterr().err.strip().splitlines()
-    assert line == "interrupted: training goes on from the last checkpoint with --resume=true"
+    assert line == "interrupted: training continues from the last checkpoint with --resume=true"
     assert outside == []
 
 

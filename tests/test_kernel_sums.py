@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel sums, each way of computing them against brute force in double precision."""
+"""Kernel sums: each implementation against brute force in double precision."""
 
 import subprocess
 import sys
@@ -35,7 +35,7 @@ def check(way, queries: torch.Tensor, anchors: torch.Tensor, h: float, rtol: flo
 @EVERY_WAY
 @pytest.mark.parametrize("dim", [1, 2, 3, 9, 32])
 @pytest.mark.parametrize("h", [0.015, 0.3])
-def test_sums_at_demonstrated_places_are_those_of_brute_force(way, dim: int, h: float) -> None:
+def test_sums_at_demonstrated_positions_are_those_of_brute_force(way, dim: int, h: float) -> None:
     anchors = paths(3000, dim)
     queries = anchors[::7] + h * torch.randn(
         len(anchors[::7]), dim, generator=torch.Generator().manual_seed(1)

@@ -82,7 +82,7 @@ def test_a_query_that_is_not_a_number_spoils_no_other() -> None:
 
 @pytest.mark.parametrize("n_threads", [1, 2])
 @pytest.mark.parametrize("dim", [1, 2, 3, 9])
-def test_the_way_to_the_nearest_target_is_that_of_all_distances(dim: int, n_threads: int) -> None:
+def test_the_offset_to_the_nearest_target_is_that_of_all_distances(dim: int, n_threads: int) -> None:
     sums = KernelSums(paths(3000, dim) + 100, 0.05)
     queries = sums.anchors[::2] + 0.1 * torch.randn(1500, dim)
     targets = sums.anchors[:300]
@@ -99,9 +99,9 @@ def test_the_way_to_the_nearest_target_is_that_of_all_distances(dim: int, n_thre
 
 @pytest.mark.parametrize("n_threads", [1, 2])
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
-@pytest.mark.parametrize("reach", [0.0, 0.01, 10.0])
-def test_a_step_is_a_share_of_the_way_to_the_mean_and_the_reach_to_a_target(
-    reach: float, share: float, n_threads: int
+@pytest.mark.parametrize("max_distance", [0.0, 0.01, 10.0])
+def test_a_step_is_a_share_of_the_offset_to_the_mean_and_a_limited_one_to_a_target(
+    max_distance: float, share: float, n_threads: int
 ) -> None:
     sums = KernelSums(paths(3000, 3), 0.05)
     queries = sums.anchors[::2] + 0.1 * torch.randn(1500, 3)
@@ -111,16 +111,16 @@ def test_a_step_is_a_share_of_the_way_to_the_mean_and_the_reach_to_a_target(
     log_sum = log_sums.median().item()
     ways = sums.tree.offsets_to(targets, queries + shifts, log_sum)
     lengths = ways.norm(dim=1, keepdim=True)
-    wanted = shifts + ways * (reach / lengths.clamp_min(max(reach, 1e-9)))
+    wanted = shifts + ways * (max_distance / lengths.clamp_min(max(max_distance, 1e-9)))
     with threads(n_threads):
-        found = sums.tree.steps_to(targets, queries, log_sum, share, reach)
+        found = sums.tree.steps_to(targets, queries, log_sum, share, max_distance)
     is_clear = (log_sums - log_sum).abs() > 1e-4
     torch.testing.assert_close(found[is_clear], wanted[is_clear], rtol=1e-4, atol=1e-5)
     assert 300 < (lengths > 0).sum() < 1200
 
 
 @pytest.mark.parametrize("far", [1e6, 3e38, torch.nan])
-def test_ways_end_somewhere(far: float) -> None:
+def test_steps_from_far_away_are_finite(far: float) -> None:
     queries = torch.tensor([[far, 0.0], [0.0, -far], [5.0, 5.0]])
     anchors = paths(300, 2)
     sums = KernelSums(anchors, 0.05)
@@ -134,14 +134,15 @@ def test_ways_end_somewhere(far: float) -> None:
 
 
 def test_the_extension_refuses_arrays_that_do_not_fit() -> None:
-    leaves, boxes, centre, scale, reach = held = KernelTree.of(paths(300, 2), 0.05)._held
+    held = KernelTree.of(paths(300, 2), 0.05)._held
+    leaves, boxes, centre, exponent_per_square, exponent_range = held
     queries, log_sums = np.zeros((5, 2), np.float32), np.zeros(5, np.float32)
     bad_trees = [
-        (leaves[1:], boxes, centre, scale, reach),
-        (leaves, boxes[:-1], centre, scale, reach),
-        (leaves, boxes[:-2], centre, scale, reach),
-        (leaves, boxes, centre[1:], scale, reach),
-        (leaves, boxes, centre[:0], scale, reach),
+        (leaves[1:], boxes, centre, exponent_per_square, exponent_range),
+        (leaves, boxes[:-1], centre, exponent_per_square, exponent_range),
+        (leaves, boxes[:-2], centre, exponent_per_square, exponent_range),
+        (leaves, boxes, centre[1:], exponent_per_square, exponent_range),
+        (leaves, boxes, centre[:0], exponent_per_square, exponent_range),
     ]
     for tree in bad_trees:
         with pytest.raises(ValueError, match="do not fit"):

@@ -426,7 +426,7 @@ def test_a_wall_touched_and_left_again_within_one_step_is_a_collision() -> None:
 
 
 @pytest.mark.parametrize("control", CONTROLS)
-def test_the_clearance_of_a_step_is_that_of_its_way_in_metres(control: str) -> None:
+def test_the_clearance_of_a_step_is_that_of_its_path_in_metres(control: str) -> None:
     env = MazeEnv(CORRIDOR, control=control)
     env.reset(seed=0, options={"start": (-1.0, 0.0), "goal": (2.0, 0.0)})
     *_, info = env.step(np.array([-0.9, 0.0]))
@@ -479,7 +479,7 @@ def test_random_episodes_earn_minus_their_collision() -> None:
     assert set(sums) == {0.0, -1.0}
 
 
-def test_a_way_through_a_wall_collides_though_both_its_ends_are_free() -> None:
+def test_a_path_through_a_wall_collides_though_both_its_ends_are_free() -> None:
     env = MazeEnv(RING)
     env.reset(seed=0, options={"start": (0.7, 0.0), "goal": (-1.0, 1.0)})
     _, reward, _, _, info = env.step(np.array([-0.7, 0.0]))
@@ -497,7 +497,7 @@ def test_a_centre_may_pass_where_a_ball_collides() -> None:
         assert info["clearance"] == pytest.approx(0.05 - radius, abs=1e-5)
 
 
-def test_the_path_length_is_that_of_the_way_so_far_in_this_episode() -> None:
+def test_the_path_length_is_that_of_the_path_so_far_in_this_episode() -> None:
     env = MazeEnv(CORRIDOR)
     way = np.array([(-2.0, 0.0), (-1.7, 0.4), (-1.7, 0.4), (-1.7, -0.2), (1.0, 0.0), (1.0, 0.45), (1.2, 0.3)])
     for _ in range(2):  # a second episode begins at zero again
@@ -510,7 +510,7 @@ def test_the_path_length_is_that_of_the_way_so_far_in_this_episode() -> None:
         assert info["is_collision"]  # which does not stop the count
 
 
-def test_the_path_length_of_a_pd_ball_is_that_of_the_way_it_takes() -> None:
+def test_the_path_length_of_a_pd_ball_is_that_of_the_path_it_takes() -> None:
     env = MazeEnv(CORRIDOR, control="pd")
     observation, info = env.reset(seed=0, options={"start": (-2.0, 0.0), "goal": (2.0, 0.0)})
     straight = 0.0
@@ -586,7 +586,7 @@ def n_pixels_like(picture: np.ndarray, colour: tuple[int, int, int]) -> int:
 
 @pytest.mark.parametrize("maze_map", ["umaze", "medium", "large", CORRIDOR])
 @pytest.mark.parametrize("size", [32, 127, 480])
-def test_pictures_have_even_sides(maze_map: str, size: int) -> None:
+def test_images_have_even_sides(maze_map: str, size: int) -> None:
     env = MazeEnv(maze_map, render_mode="rgb_array", render_size=size)
     env.reset(seed=0)
     picture = env.render()
@@ -599,7 +599,7 @@ def test_pictures_have_even_sides(maze_map: str, size: int) -> None:
     assert width / height == pytest.approx(len(rows[0]) / len(rows), rel=0.1)
 
 
-def test_pictures_show_the_way_and_the_collisions() -> None:
+def test_images_show_the_path_and_the_collisions() -> None:
     env = MazeEnv(CORRIDOR, render_mode="rgb_array")
     blue, dark_red = (31, 119, 180), (200, 20, 20)
     env.reset(seed=0, options={"start": (-2.0, 0.0), "goal": (2.0, 0.0)})
@@ -614,7 +614,7 @@ def test_pictures_show_the_way_and_the_collisions() -> None:
     np.testing.assert_array_equal(env.render(), at_rest)
 
 
-def test_pictures_show_ball_and_goal_where_they_are() -> None:
+def test_images_show_ball_and_goal_where_they_are() -> None:
     env = MazeEnv("1111/1001/1001/1001/1111", render_mode="rgb_array", render_size=500)
     env.reset(seed=0, options={"start": (-0.5, 1.0), "goal": (0.5, -1.0)})
     picture = env.render()
@@ -625,7 +625,7 @@ def test_pictures_show_ball_and_goal_where_they_are() -> None:
     np.testing.assert_array_equal(picture[250, 250], (250, 247, 242))
 
 
-def test_without_a_render_mode_there_is_no_picture() -> None:
+def test_without_a_render_mode_there_is_no_image() -> None:
     env = MazeEnv("umaze")
     env.reset(seed=0)
     assert env.render() is None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Policies that see pictures, from demonstrations to evaluation."""
+"""Policies that observe images, from demonstrations to evaluation."""
 
 import json
 from pathlib import Path
@@ -31,7 +31,7 @@ ENVS = {
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A few demonstrations with pictures of every environment."""
+    """A few demonstrations with images of every environment."""
     folder = tmp_path_factory.mktemp("data")
     roots = {name: folder / name for name in ENVS}
     common = {"n_episodes": 3, "seed": 0, "overwrite": False, "image_width": WIDTH}
@@ -81,7 +81,7 @@ def test_an_unknown_kind_of_observation_is_an_error() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ENVS)
-def test_demonstrations_hold_the_pictures_of_their_environment_and_nothing_more(
+def test_demonstrations_hold_the_images_of_their_environment_and_nothing_more(
     name: str, data: dict[str, Path]
 ) -> None:
     dataset = LeRobotDataset(f"local/{name}", root=data[name])
@@ -94,7 +94,7 @@ def test_demonstrations_hold_the_pictures_of_their_environment_and_nothing_more(
 
 
 @pytest.mark.slow
-def test_a_maze_is_pictured_as_the_environment_shows_it(data: dict[str, Path]) -> None:
+def test_a_maze_is_drawn_as_the_environment_shows_it(data: dict[str, Path]) -> None:
     dataset = LeRobotDataset("local/maze", root=data["maze"])
     env = gym.make(
         "lerobot_pf2mp/MazeUMaze-v0", render_mode="rgb_array", render_size=WIDTH, max_episode_steps=20
@@ -170,7 +170,7 @@ def keys_that_matter(checkpoint: Path) -> list[str]:
         ("pf2mp", "handwriting", ["--policy.n_obs_steps=1", "--policy.crop_shape=[60,80]"]),
     ],
 )
-def test_a_policy_with_pictures_trains_saves_loads_and_evaluates(
+def test_a_policy_with_images_trains_saves_loads_and_evaluates(
     policy: str, name: str, options: list[str], data: dict[str, Path], tmp_path: Path
 ) -> None:
     checkpoint = train(policy, data[name], tmp_path / "out", *options)

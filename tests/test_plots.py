@@ -215,7 +215,9 @@ def test_the_extent_is_that_of_the_maze_or_else_of_the_demonstrations() -> None:
 # Paths
 
 
-def test_trajectories_show_both_ways_their_ends_and_collisions(tmp_path: Path, drawn: list[Figure]) -> None:
+def test_trajectories_show_both_trajectories_their_ends_and_collisions(
+    tmp_path: Path, drawn: list[Figure]
+) -> None:
     pairs = [replace(PAIR, episode=i) for i in range(4)]
     figures.plot_trajectories(
         tmp_path / "trajectories.png", scene=scene_of((0.0, 0.0), (1.0, 0.0), maze_map=MAZE_MAP), pairs=pairs
@@ -256,13 +258,13 @@ def test_obstacles_are_drawn_in_space(tmp_path: Path, drawn: list[Figure]) -> No
     for face in faces(wall):  # four corners of one side, in order: each differs from the next on one axis
         assert (np.abs(np.diff(face, axis=0, append=face[:1])) > 0).sum(axis=1).tolist() == [1, 1, 1, 1]
     assert sides.get_alpha() == 0.25
-    # The axes show the wall and the way at one scale.
+    # The axes show the wall and the trajectory in equal units.
     low, high = np.transpose([axis.get_xlim(), axis.get_ylim(), axis.get_zlim()])
     assert np.all(low <= wall.low)
     assert np.all(high >= wall.high)
 
 
-def test_the_overview_says_which_way_collides(tmp_path: Path, drawn: list[Figure]) -> None:
+def test_the_overview_says_which_trajectory_collides(tmp_path: Path, drawn: list[Figure]) -> None:
     scene = scene_of((0.0, 0.0), (0.2, 0.0), maze_map=MAZE_MAP)
     figures.plot_maze_overview(tmp_path / "overview.png", scene=scene, pair=PAIR)
     assert [axis.get_title() for axis in drawn[0].axes] == [

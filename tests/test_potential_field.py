@@ -462,7 +462,7 @@ def test_the_blocks_do_not_change_the_result(monkeypatch):
 
 @pytest.mark.parametrize("has_extension", [True, False])
 @pytest.mark.parametrize(("share", "reach"), [(0.0, 0.05), (0.4, 0.05), (1.0, 100.0)])
-def test_a_step_to_safety_is_part_of_the_mean_shift_and_then_of_the_way_to_the_safe_set(
+def test_a_step_to_safety_is_part_of_the_mean_shift_and_then_of_the_offset_to_the_safe_set(
     share, reach, has_extension, monkeypatch
 ):
     if not has_extension:

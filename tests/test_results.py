@@ -45,9 +45,8 @@ def test_rows_come_back_as_they_were_bit_for_bit(tmp_path: Path) -> None:
     rows = awkward_rows()
     write_rows(tmp_path / "new/folder/rows.csv", rows, EpisodeRow)
     back = read_rows(tmp_path / "new/folder/rows.csv", EpisodeRow)
-    assert [repr(row) for row in back] == [
-        repr(row) for row in rows
-    ]  # also tells 0.0 from -0.0, and 1 from True
+    # repr also distinguishes 0.0 from -0.0, and 1 from True.
+    assert [repr(row) for row in back] == [repr(row) for row in rows]
     assert [path.name for path in (tmp_path / "new/folder").iterdir()] == ["rows.csv"]
 
 
@@ -199,7 +198,7 @@ def test_repeats_are_told_apart_by_all_that_they_are(other: dict[str, Any]) -> N
 def test_guided_episodes_are_paired_with_the_same_episodes_of_their_twin() -> None:
     unguided = episodes([True, True, True, False, False, False, True], **UNGUIDED)
     guided = episodes([False, False, True, True, False, False, False])
-    first, second = summarise([*unguided, *guided[::-1]])  # found by their number rather than their place
+    first, second = summarise([*unguided, *guided[::-1]])  # found by their number rather than their order
     assert (first.only_unguided_collides, first.only_guided_collides) == (None, None)
     assert (second.only_unguided_collides, second.only_guided_collides) == (3, 1)
     assert (first.collisions, second.collisions) == (4, 2)

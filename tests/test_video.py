@@ -22,13 +22,13 @@ def frames_of(path: Path) -> np.ndarray:
 
 
 def n_coloured(pictures: np.ndarray, colour: str) -> list[int]:
-    """How many pixels of each ``(N, H, W, 3)`` picture have about a colour."""
+    """The number of pixels with about a colour in each of ``(N, H, W, 3)`` images."""
     wanted = 255 * np.array(to_rgb(colour))
     return (np.abs(pictures - wanted).max(axis=-1) < 70).sum(axis=(1, 2)).tolist()
 
 
 @pytest.mark.parametrize("background", list(THEMES))
-def test_two_films_run_side_by_side_and_a_collision_is_written_from_when_it_happens(
+def test_two_videos_run_side_by_side_and_a_collision_is_written_from_when_it_happens(
     tmp_path: Path, background: str
 ) -> None:
     output = tmp_path / "new" / "video.mp4"

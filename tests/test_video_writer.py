@@ -17,7 +17,7 @@ SPEC = fetch_spec("reach", "local/reach", "Made up.", 6, image_size=(48, 64))
 
 
 def episode(grey: int) -> dict[str, np.ndarray]:
-    """Six frames whose pictures become brighter."""
+    """Six frames whose images become brighter."""
     pictures = np.full((6, 48, 64, 3), grey, dtype=np.uint8) + 10 * np.arange(6, dtype=np.uint8).reshape(
         -1, 1, 1, 1
     )
@@ -30,7 +30,7 @@ def episode(grey: int) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.slow
-def test_pictures_and_numbers_read_back(tmp_path: Path) -> None:
+def test_images_and_numbers_read_back(tmp_path: Path) -> None:
     root = tmp_path / "new" / "d"
     assert write_video_dataset(root, SPEC, iter([episode(20), episode(120)])) == 2
     assert [path.name for path in root.parent.iterdir()] == ["d"]
@@ -64,7 +64,7 @@ def test_a_specification_has_images_only_if_asked_for() -> None:
 
 
 @pytest.mark.parametrize("n_steps", [3, 6, 12])
-def test_each_frame_has_the_last_picture_before_it(n_steps: int) -> None:
+def test_each_frame_has_the_last_image_before_it(n_steps: int) -> None:
     pictures = np.arange(7, dtype=np.uint8).reshape(-1, 1, 1, 1) * np.ones((1, 2, 2, 3), dtype=np.uint8)
     trajectory = Trajectory(np.arange(21.0).reshape(7, 3), np.zeros(3), images=pictures)
     (frames,) = prepare([trajectory], n_steps, lambda way: False, Counter())
@@ -74,7 +74,7 @@ def test_each_frame_has_the_last_picture_before_it(n_steps: int) -> None:
 
 
 @pytest.mark.slow
-def test_collected_pictures_are_those_of_the_environment(tmp_path: Path) -> None:
+def test_collected_images_are_those_of_the_environment(tmp_path: Path) -> None:
     n_written, _ = collect_fetch(
         "reach",
         root=tmp_path / "d",
@@ -93,7 +93,7 @@ def test_collected_pictures_are_those_of_the_environment(tmp_path: Path) -> None
     recording = ScriptedFetchExpert(
         FetchEnv("reach", render_mode="rgb_array", render_size=64), seed=3
     ).demonstrate(0)
-    first, last = recording.pictures[0].astype(float), recording.pictures[-2].astype(float)
+    first, last = recording.images[0].astype(float), recording.images[-2].astype(float)
     for frame, picture, other in ((0, first, last), (47, last, first)):
         shown = 255 * dataset[frame][IMAGE_KEY].permute(1, 2, 0).numpy()
         assert np.abs(shown - picture).mean() < 0.5 * np.abs(shown - other).mean()

@@ -25,7 +25,7 @@ from lerobot_pf2mp.envs.handwriting.stroke import distances, evenly_spaced, line
 from lerobot_pf2mp.envs.handwriting.writing_scene import WritingScene, check_on_sheet, make_writing_scene
 
 SPACING = 0.001  # of a scene's stroke [m]
-GRID = 0.002  # of the places of regions [m]
+GRID = 0.002  # of the candidate centres of regions [m]
 RADII = (0.006, 0.045)  # of the regions of a letter [m]
 NAN, INFINITE = float("nan"), float("inf")
 BAR = [[0.42, -0.1], [0.42, 0.1]]  # a stroke, straight to the left
@@ -145,9 +145,8 @@ def test_a_letter_that_does_not_exist_is_refused_with_the_choices(letter: Any) -
 def test_evenly_spaced_points_keep_the_ends_and_stay_on_the_line() -> None:
     rng = np.random.default_rng(0)
     for n, spacing in itertools.product((2, 3, 8), (0.001, 0.013, 0.3)):
-        corners = np.cumsum(
-            rng.uniform((0.01, -0.1), 0.1, size=(n, 2)), axis=0
-        )  # x grows: it never crosses itself
+        # x grows, so the line never crosses itself.
+        corners = np.cumsum(rng.uniform((0.01, -0.1), 0.1, size=(n, 2)), axis=0)
         points = evenly_spaced(corners, spacing)
         np.testing.assert_allclose(points[[0, -1]], corners[[0, -1]], atol=1e-12)
         assert to_segments(points, corners).max() < 1e-12
@@ -157,7 +156,7 @@ def test_evenly_spaced_points_keep_the_ends_and_stay_on_the_line() -> None:
             assert 2 / 3 <= places[-1] / (len(places) - 1) / spacing <= 1.5
 
 
-def test_evenly_spaced_points_of_a_single_place_are_that_place() -> None:
+def test_evenly_spaced_points_of_a_single_position_are_that_position() -> None:
     place = np.array([0.5, 0.1])
     np.testing.assert_array_equal(evenly_spaced(place[None], 0.01), [place])
     np.testing.assert_array_equal(evenly_spaced(np.array([place] * 4), 0.01), [place])
@@ -169,7 +168,7 @@ def test_evenly_spaced_points_of_a_short_line_are_its_ends() -> None:
     np.testing.assert_allclose(evenly_spaced(ends, 0.01), ends)
 
 
-def test_distances_are_those_to_the_nearest_place_on_the_line_not_to_its_corners() -> None:
+def test_distances_are_those_to_the_nearest_position_on_the_line_not_to_its_corners() -> None:
     rng = np.random.default_rng(0)
     stroke = np.cumsum(rng.normal(0, 0.1, size=(6, 2)), axis=0)
     points = rng.uniform(-0.3, 0.3, size=(50, 2))
@@ -180,7 +179,7 @@ def test_distances_are_those_to_the_nearest_place_on_the_line_not_to_its_corners
     assert (to_corners - nearest).max() > 0.03
 
 
-def test_distances_to_a_single_place_are_straight() -> None:
+def test_distances_to_a_single_position_are_straight() -> None:
     place = np.array([[0.1, 0.2]])
     points = np.array([[0.1, 0.2], [0.4, 0.6]])
     np.testing.assert_allclose(distances(points, place), [0, 0.5])
@@ -198,7 +197,7 @@ def ways(n: int, length: float) -> list[np.ndarray]:
 
 @pytest.mark.parametrize("region", REGIONS, ids=["disc", "square", "hook"])
 @pytest.mark.parametrize("length", [0.0, 0.01, 0.05])
-def test_the_clearance_of_a_way_is_that_of_its_nearest_or_deepest_place(
+def test_the_clearance_of_a_path_is_that_of_its_nearest_or_deepest_position(
     region: Region, length: float
 ) -> None:
     n_inside = n_outside = 0
@@ -212,7 +211,7 @@ def test_the_clearance_of_a_way_is_that_of_its_nearest_or_deepest_place(
 
 
 @pytest.mark.parametrize("region", REGIONS, ids=["disc", "square", "hook"])
-def test_the_clearance_of_one_place_is_its_distance_or_minus_its_depth(region: Region) -> None:
+def test_the_clearance_of_one_position_is_its_distance_or_minus_its_depth(region: Region) -> None:
     places = np.random.default_rng(0).uniform((0.4, -0.1), (0.6, 0.1), size=(200, 2))
     for place, depth in zip(places, depth_in(region, places), strict=True):
         for way in (place[None], np.array([place, place])):
@@ -220,7 +219,7 @@ def test_the_clearance_of_one_place_is_its_distance_or_minus_its_depth(region: R
 
 
 @pytest.mark.parametrize("region", REGIONS, ids=["disc", "square", "hook"])
-def test_a_way_that_crosses_a_region_between_two_places_outside_is_inside(region: Region) -> None:
+def test_a_path_that_crosses_a_region_between_two_positions_outside_is_inside(region: Region) -> None:
     way = np.array([[0.3, -0.022], [0.7, -0.022]])
     for place in way:
         assert region.clearance(place[None]) > 0.1
@@ -289,13 +288,16 @@ def test_what_describes_no_region_is_refused_with_both_forms(content: Any) -> No
         ({"centre": [0.5, 0.0], "radius": 0.0}, "radius of a disc must be at least 0.001 m, got 0.0"),
         ({"centre": [0.5, 0.0], "radius": -0.02}, "radius of a disc must be at least 0.001 m, got -0.02"),
         ({"centre": [0.5, 0.0], "radius": INFINITE}, "radius of a disc must be at least .* got inf"),
-        ({"corners": [[0.4, 0.0], [0.5, 0.0]]}, "corners of a polygon must be at least three finite places"),
+        (
+            {"corners": [[0.4, 0.0], [0.5, 0.0]]},
+            "corners of a polygon must be at least three finite positions",
+        ),
         (
             {"corners": [[0.4, 0.0], [0.5, 0.0], [0.5, INFINITE]]},
-            "at least three finite places x, y .* got .*inf",
+            "at least three finite positions x, y .* got .*inf",
         ),
-        ({"corners": [[0.4, 0.0, 0.0]] * 3}, "at least three finite places x, y .* got"),
-        ({"corners": []}, "at least three finite places x, y .* got"),
+        ({"corners": [[0.4, 0.0, 0.0]] * 3}, "at least three finite positions x, y .* got"),
+        ({"corners": []}, "at least three finite positions x, y .* got"),
         ({"corners": [[0.4, 0.0], [0.5, 0.1], [0.4, 0.1], [0.55, 0.0]]}, "not cross itself, got"),
         ({"corners": [[0.4, 0.0], [0.4005, 0.0], [0.4, 0.0005]]}, "must have an inside .* got"),
         ({"corners": [[0.4, 0.0], [0.5, 0.0], [0.6, 0.0]]}, "must have an inside .* got"),
@@ -426,15 +428,15 @@ def test_the_sheet_ends_at_its_border() -> None:
                 check_on_sheet(outside, "start")
 
 
-def test_the_first_place_off_the_sheet_is_named() -> None:
+def test_the_first_position_off_the_sheet_is_named() -> None:
     places = np.array([[0.5, 0.0], [0.6, 0.17], [0.9, 0.0]])
     with pytest.raises(ValueError, match=r"y in \[-0.16, 0.16\] m of its base; got \[0.6, 0.17\]"):
         check_on_sheet(places, "start")
 
 
 @pytest.mark.parametrize("place", [0.5, [], [0.5], [0.5, 0.0, 0.0], [0.5, NAN], [INFINITE, 0.0]], ids=str)
-def test_what_is_no_place_is_not_on_the_sheet(place: Any) -> None:
-    with pytest.raises(ValueError, match=r"start must be finite places x, y \[m\], got"):
+def test_what_is_no_position_is_not_on_the_sheet(place: Any) -> None:
+    with pytest.raises(ValueError, match=r"start must be finite positions x, y \[m\], got"):
         check_on_sheet(np.array(place), "start")
 
 
@@ -477,20 +479,23 @@ def test_a_file_may_leave_out_the_regions(tmp_path: Path) -> None:
         ({"stroke": BAR, "regions": {"centre": [0.5, 0]}}, "the regions in .*mine.json must be a list, got"),
         ({"stroke": BAR, "regions": None}, "the regions in .*mine.json must be a list, got None"),
         ({"stroke": BAR, "regions": [{"centre": [0.5, 0]}]}, "a region must be .* got"),
-        ({"stroke": [], "regions": []}, "the stroke in .*mine.json must be two or more finite places"),
-        ({"stroke": [[0.5, 0.0]]}, "the stroke in .*mine.json must be two or more finite places"),
-        ({"stroke": [0.5, 0.0]}, "the stroke in .*mine.json must be two or more finite places"),
-        ({"stroke": "S"}, "the stroke in .*mine.json must be two or more finite places"),
-        ({"stroke": None}, "the stroke in .*mine.json must be two or more finite places"),
-        ({"stroke": [[0.5, 0.0], [0.5]]}, "the stroke in .*mine.json must be two or more finite places"),
+        ({"stroke": [], "regions": []}, "the stroke in .*mine.json must be two or more finite positions"),
+        ({"stroke": [[0.5, 0.0]]}, "the stroke in .*mine.json must be two or more finite positions"),
+        ({"stroke": [0.5, 0.0]}, "the stroke in .*mine.json must be two or more finite positions"),
+        ({"stroke": "S"}, "the stroke in .*mine.json must be two or more finite positions"),
+        ({"stroke": None}, "the stroke in .*mine.json must be two or more finite positions"),
+        ({"stroke": [[0.5, 0.0], [0.5]]}, "the stroke in .*mine.json must be two or more finite positions"),
         (
             {"stroke": [[0.5, 0.0], [0.5, None]]},
-            "the stroke in .*mine.json must be two or more finite places",
+            "the stroke in .*mine.json must be two or more finite positions",
         ),
-        ({"stroke": [[0.5, 0.0], [NAN, 0.1]]}, "the stroke in .*mine.json must be two or more finite places"),
+        (
+            {"stroke": [[0.5, 0.0], [NAN, 0.1]]},
+            "the stroke in .*mine.json must be two or more finite positions",
+        ),
         (
             {"stroke": [[0.5, 0, 0], [0.5, 0.1, 0]]},
-            "the stroke in .*mine.json must be two or more finite places",
+            "the stroke in .*mine.json must be two or more finite positions",
         ),
         ({"stroke": [[0.5, 0.0], [0.5, 0.2]]}, "the stroke of mine must lie on the sheet"),
         ({"stroke": [[0.5, 0.0], [0.5, 0.019]]}, "a stroke must be at least 0.02 m long, got that of mine"),
