@@ -200,14 +200,12 @@ def _be_the_command(
     os.chdir(cwd)
     os.environ.clear()
     os.environ.update(env)
-    multiprocessing.set_forkserver_preload(
-        _IMPORTED_BEFORE
-    )  # for environments side by side, which it starts itself
+    # For environments side by side, whose processes the command starts itself.
+    multiprocessing.set_forkserver_preload(_IMPORTED_BEFORE)
     np.random.seed()  # all forks would draw the same numbers
     sys.argv = [str(BIN / arguments[0]), *arguments[1:]]
-    sys.modules["__main__"] = types.ModuleType(
-        "__main__"
-    )  # not the tests', which its own processes would import
+    # Not the main module of the tests, which the command's own processes would import.
+    sys.modules["__main__"] = types.ModuleType("__main__")
     (script,) = entry_points(group="console_scripts", name=arguments[0])
     try:
         sys.exit(script.load()())

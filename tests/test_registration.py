@@ -6,17 +6,50 @@ import sys
 
 import pytest
 
-ARE_REGISTERED = """
-from lerobot.configs import PreTrainedConfig
-from lerobot.envs.configs import EnvConfig
-from lerobot.optim import OptimizerConfig
-from lerobot.processor import ProcessorStepRegistry
-import gymnasium
-assert {"fmp", "pf2mp", "dppf"} <= set(PreTrainedConfig.get_known_choices())
-assert {"pf2mp_maze", "pf2mp_fetch", "pf2mp_handwriting"} <= set(EnvConfig.get_known_choices())
-assert "fused_adamw" in OptimizerConfig.get_known_choices()
-assert "potential_field" in ProcessorStepRegistry.list()
-assert len([name for name in gymnasium.registry if name.startswith("lerobot_pf2mp/")]) == 7
+# What a program imports first, in the notation of `pkgutil.resolve_name`.
+FIRST = (
+    ("lerobot_pf2mp",),
+    ("lerobot", "lerobot_pf2mp"),
+    ("lerobot.policies", "gymnasium", "lerobot_pf2mp"),
+    ("lerobot_policy_pf2mp",),
+    ("lerobot_pf2mp:FMPConfig",),
+    # Modules that register, as the first of all: the import of LeRobot in them must not meet them half imported.
+    ("lerobot_pf2mp.envs.configs.collision_env",),
+    ("lerobot_pf2mp.policies.fmp.fused_adamw",),
+    ("lerobot_pf2mp.policies.fmp.modeling_fmp",),
+    ("lerobot_pf2mp.policies.guided.potential_field_step",),
+)
+# Each case is a fork of a process that has imported what takes long, but none of the packages that register.
+EACH_FIRST = f"""
+import os, pkgutil, sys, traceback
+import datasets, diffusers, torch
+
+def check_registrations():
+    from lerobot.configs import PreTrainedConfig
+    from lerobot.envs.configs import EnvConfig
+    from lerobot.optim import OptimizerConfig
+    from lerobot.processor import ProcessorStepRegistry
+    import gymnasium
+    assert {{"fmp", "pf2mp", "dppf"}} <= set(PreTrainedConfig.get_known_choices())
+    assert {{"pf2mp_maze", "pf2mp_fetch", "pf2mp_handwriting"}} <= set(EnvConfig.get_known_choices())
+    assert "fused_adamw" in OptimizerConfig.get_known_choices()
+    assert "potential_field" in ProcessorStepRegistry.list()
+    assert len([name for name in gymnasium.registry if name.startswith("lerobot_pf2mp/")]) == 7
+
+assert not {{"lerobot", "lerobot_pf2mp", "gymnasium"}} & set(sys.modules)
+for first in {FIRST!r}:
+    pid = os.fork()
+    if not pid:
+        try:
+            for name in first:
+                pkgutil.resolve_name(name)
+            check_registrations()
+            os._exit(0)
+        except BaseException:
+            traceback.print_exc()
+            sys.stderr.flush()
+            os._exit(1)
+    print(*first, os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), flush=True)
 """
 
 
@@ -30,23 +63,8 @@ def run(code: str) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "first",
-    [
-        "import lerobot_pf2mp",
-        "import lerobot, lerobot_pf2mp",
-        "import lerobot.policies, gymnasium, lerobot_pf2mp",
-        "import lerobot_policy_pf2mp",
-        "from lerobot_pf2mp import FMPConfig",
-        # Modules that register, as the first of all: the import of LeRobot in them must not meet them half imported.
-        "import lerobot_pf2mp.envs.configs.collision_env",
-        "import lerobot_pf2mp.policies.fmp.fused_adamw",
-        "import lerobot_pf2mp.policies.fmp.modeling_fmp",
-        "import lerobot_pf2mp.policies.guided.potential_field_step",
-    ],
-)
-def test_everything_is_registered_whatever_is_imported_first(first: str) -> None:
-    run(f"{first}\n{ARE_REGISTERED}")
+def test_everything_is_registered_whatever_is_imported_first() -> None:
+    assert run(EACH_FIRST).splitlines() == [" ".join([*first, "0"]) for first in FIRST]
 
 
 def test_the_maths_needs_torch_alone() -> None:
