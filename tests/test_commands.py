@@ -563,6 +563,10 @@ def test_collect_takes_demonstrations_in_fetch(
             ["--obs_type=pixels_agent_pos", "--image_width=3"],
             "error: render_size must be at least 32 pixels, got 3",
         ),
+        (  # the earlier name of the option
+            ["--obs_type=pixels_agent_pos", "--picture_width=4"],
+            "error: render_size must be at least 32 pixels, got 4",
+        ),
         (["--expert=nowhere"], "error: nowhere must be a folder written by pf2mp-train-expert"),
     ],
 )

@@ -46,7 +46,7 @@ def run_demo(
         ValueError: If an argument breaks its rule, or the folder holds a demo with other options.
         RuntimeError: If a command fails.
     """
-    maze = maze_of(task, None)
+    maze_of(task, None)  # raises an error for an unknown task now, not later
     for name, value in (
         ("n_demonstrations", n_demonstrations),
         ("steps", steps),
@@ -66,20 +66,7 @@ def run_demo(
     data, checkpoint = output_dir / "demonstrations", output_dir / "train/checkpoints/last/pretrained_model"
 
     _say(1, f"Demonstrations: {n_demonstrations} trajectories of a scripted expert in the MuJoCo maze")
-    if data.exists():
-        print("done already")
-    else:
-        n_written, dropped = collect_maze(
-            maze,
-            root=data,
-            repo_id=f"local/{task}",
-            n_episodes=n_demonstrations,
-            n_steps=MAZE_STEPS,
-            action_noise=0.0,
-            seed=seed,
-            overwrite=False,
-        )
-        print(f"{n_written} collision-free trajectories ({dropped.total()} left out)")
+    _collect(task, data, n_demonstrations, seed)
 
     _say(2, f"Training: a small network, {steps} steps; the potential field is fitted during training")
     _train(task, data, output_dir / "train", steps, seed)
@@ -94,15 +81,7 @@ def run_demo(
         episodes += _evaluate(task, checkpoint, folder, n_episodes, seed, guidance_scale)
 
     _say(5, "Figure and table")
-    figure = output_dir / "overview.png"
-    if not figure.exists():
-        figures = GuidedPolicyFigures(checkpoint, PF2MPMazeEnv(task=_env_task(task)), seed=seed)
-        figures.draw("overview", figure, 1, (), "light")
-    results = summarise(episodes)
-    table = _table(results)
-    (output_dir / "results.md").write_text(table, encoding="utf-8")
-    write_rows(output_dir / "results.csv", results, SummaryRow)
-    print(f"\n{table}\nFigure: {figure}\nTable: {output_dir / 'results.md'}")
+    _report(task, checkpoint, output_dir, episodes, seed)
     print(f"Time: {(time.monotonic() - began) / 60:.1f} minutes")
 
 
@@ -120,6 +99,23 @@ def _claim(output_dir: Path, options: dict[str, object]) -> None:
     else:
         output_dir.mkdir(parents=True, exist_ok=True)
         mark.write_text(json.dumps(options, indent=2), encoding="utf-8")
+
+
+def _collect(task: str, data: Path, n_demonstrations: int, seed: int) -> None:
+    if data.exists():
+        print("done already")
+        return
+    n_written, dropped = collect_maze(
+        maze_of(task, None),
+        root=data,
+        repo_id=f"local/{task}",
+        n_episodes=n_demonstrations,
+        n_steps=MAZE_STEPS,
+        action_noise=0.0,
+        seed=seed,
+        overwrite=False,
+    )
+    print(f"{n_written} collision-free trajectories ({dropped.total()} left out)")
 
 
 def _train(task: str, data: Path, output_dir: Path, steps: int, seed: int) -> None:
@@ -192,7 +188,7 @@ def _evaluate(
         EpisodeRow(
             task=env_task,
             policy="pf2mp" if guidance_scale else "fmp",
-            guidance_integrator="proximal" if guidance_scale else NO_GUIDANCE,
+            guidance_integrator=PF2MPConfig.guidance_integrator if guidance_scale else NO_GUIDANCE,
             guidance_scale=guidance_scale,
             variant="",
             seed=seed,
@@ -213,6 +209,19 @@ def _evaluate(
             zip(metrics["successes"], metrics["sum_rewards"], strict=True)
         )
     ]
+
+
+def _report(task: str, checkpoint: Path, output_dir: Path, episodes: list[EpisodeRow], seed: int) -> None:
+    """Draws the figure, unless it is there, and writes and prints the table."""
+    figure = output_dir / "overview.png"
+    if not figure.exists():
+        figures = GuidedPolicyFigures(checkpoint, PF2MPMazeEnv(task=_env_task(task)), seed=seed)
+        figures.draw("overview", figure, 1, (), "light")
+    results = summarise(episodes)
+    table = _table(results)
+    (output_dir / "results.md").write_text(table, encoding="utf-8")
+    write_rows(output_dir / "results.csv", results, SummaryRow)
+    print(f"\n{table}\nFigure: {figure}\nTable: {output_dir / 'results.md'}")
 
 
 def _run(command: str, *options: str, equivalent: str | None = None, log: Path | None = None) -> None:
