@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The report of pf2mp-info, in this environment and in new ones in which something is wrong."""
 
+import importlib.util
 import json
 import os
 import subprocess
@@ -17,8 +18,6 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 from pf2mp_info.trials import LINES
 from pf2mp_info.versions import EXTRAS, ranges
-
-import lerobot_pf2mp
 
 ROOT = Path(__file__).parents[1]
 BIN = Path(sys.executable).parent
@@ -77,10 +76,8 @@ def site_packages(tmp_path: Path) -> Path:
     for entry in Path(sysconfig.get_paths()["purelib"]).iterdir():
         if "pf2mp" not in entry.name and entry.suffix != ".pth":
             (folder / entry.name).symlink_to(entry)
-    package = Path(lerobot_pf2mp.__file__).parent
-    (folder / "lerobot_pf2mp").symlink_to(package)
-    (folder / "lerobot_policy_pf2mp").symlink_to(package / "_autodiscover")
-    (folder / "pf2mp_info").symlink_to(package / "_info")
+    for name in ("lerobot_pf2mp", "lerobot_policy_pf2mp", "pf2mp_info"):
+        (folder / name).symlink_to(Path(importlib.util.find_spec(name).origin).parent)
     write_metadata(folder)
     # Another plug-in that talks and fails, which is not our concern.
     write_distribution(folder, "lerobot_policy_other", "1.0")
