@@ -564,7 +564,7 @@ def test_collect_takes_demonstrations_in_fetch(
             "error: render_size must be at least 32 pixels, got 3",
         ),
         (  # the earlier name of the option
-            ["--obs_type=pixels_agent_pos", "--image_width=4"],
+            ["--obs_type=pixels_agent_pos", "--picture_width=4"],
             "error: render_size must be at least 32 pixels, got 4",
         ),
         (["--expert=nowhere"], "error: nowhere must be a folder written by pf2mp-train-expert"),
