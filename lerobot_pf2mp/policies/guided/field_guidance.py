@@ -35,7 +35,8 @@ class FieldGuidance:
     The field itself is in the batch. The policy's preprocessor puts it there (see `potential_field_step`).
 
     Args:
-        config: The policy's configuration. Its options may change between two calls.
+        config: The policy's configuration. Its options may change between two calls, except `on_unsupported` and
+            `field_action_dims`, which the monitor reads only here.
         dataset_stats: Statistics of the training dataset; None at evaluation.
     """
 
