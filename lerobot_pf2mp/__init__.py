@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Potential-field-guided flow matching policies for LeRobot.
 
-Importing this package registers the policies, their processor step and the environments with LeRobot and Gymnasium. It
-imports neither of them, nor torch: what is named here is imported when it is first used.
+Importing this package registers the policies, their processor step and the environments with LeRobot and Gymnasium, as
+soon as these are imported. It imports neither of them, nor torch. The names in `__all__` are imported at their first use.
 """
 
 from importlib import import_module

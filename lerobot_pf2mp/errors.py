@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one error type of this package, everything else raises Python's own; and how errors reach the user."""
+"""The only error type of this package, and how errors reach the user. All other errors are Python's own."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,14 +11,14 @@ from huggingface_hub.errors import HfHubHTTPError
 class ConfigError(ParsingError):
     """A value of a configuration breaks its rule.
 
-    Deliberately no ValueError: LeRobot's command line replaces those by "Couldn't instantiate class" and drops the
-    reason, whereas it prints the message of an error of this type.
+    Deliberately not a ValueError: LeRobot's command line replaces a ValueError by "Couldn't instantiate class" and drops
+    the reason. It prints the message of an error of this type.
     """
 
 
 @contextmanager
 def reported_on_the_command_line() -> Iterator[None]:
-    """Turns a ValueError or OSError of the block into a `ConfigError` with the same message."""
+    """Turns a ValueError or OSError of a `with` block into a `ConfigError` with the same message."""
     try:
         yield
     except (ValueError, OSError) as error:
@@ -27,7 +27,7 @@ def reported_on_the_command_line() -> Iterator[None]:
 
 @contextmanager
 def explained(what: str) -> Iterator[None]:
-    """Turns any error of the block, of whichever library, into one of Python's own that says what could not be done.
+    """Turns any error of a `with` block, from any library, into one of Python's own that says what could not be done.
 
     Args:
         what: What failed, for example "the checkpoint outputs/pf2mp cannot be loaded".
@@ -39,12 +39,12 @@ def explained(what: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise OSError(f"{what}: {_said_by(error)}") from error
+        raise OSError(f"{what}: {_message_of(error)}") from error
     except Exception as error:
-        raise ValueError(f"{what}: {_said_by(error)}") from error
+        raise ValueError(f"{what}: {_message_of(error)}") from error
 
 
-def _said_by(error: Exception) -> str:
+def _message_of(error: Exception) -> str:
     text = str(error) or type(error).__name__
-    # LeRobot says that a file is not on the Hub whatever the Hub has answered, also that nobody is logged in.
+    # LeRobot reports "not found on the Hub" for every error of the Hub, for example a missing login. The cause says more.
     return f"{text}: {error.__cause__}" if isinstance(error.__cause__, HfHubHTTPError) else text

@@ -45,10 +45,10 @@ def fit_field(
     options: dict[str, Any] | None = None,
     overwrite: bool = False,
 ) -> PreTrainedConfig:
-    """Writes a new checkpoint: the same weights, guided by the field of a dataset's actions.
+    """Writes a new checkpoint with the same weights, guided by the field of a dataset's actions.
 
-    The actions are normalised as the checkpoint was trained, so that the field lives where its policy generates. The
-    anchors are those that training on all frames would have kept.
+    The actions are normalised by the checkpoint's own preprocessor, so the field is in the space in which the policy
+    generates. The anchors are those that training on all frames would have kept.
 
     Args:
         checkpoint: A ``pretrained_model`` folder or a repository on the Hub, of a type in `GUIDED_TYPES`.
@@ -65,7 +65,8 @@ def fit_field(
         The new policy's configuration.
 
     Raises:
-        ValueError: If the checkpoint is of another type, its actions are not the dataset's, or an option breaks its rule.
+        ValueError: If the checkpoint has another type, its actions have another shape than the dataset's, or an option
+            breaks its rule.
         OSError: If the checkpoint or the dataset cannot be read.
         FileExistsError: If `output_dir` exists and `overwrite` is false.
     """
@@ -129,7 +130,7 @@ def _load_dataset(
             )
     except BaseException:
         if is_new and root is not None:
-            shutil.rmtree(root, ignore_errors=True)  # LeRobot begins to download into it
+            shutil.rmtree(root, ignore_errors=True)  # LeRobot may have started to download into it
         raise
 
 
@@ -144,7 +145,7 @@ def _guided_config(config: PreTrainedConfig, options: dict[str, Any]) -> PreTrai
 def _fitted_step(
     config: PreTrainedConfig, dataset: LeRobotDataset, preprocessor: PolicyProcessorPipeline
 ) -> PotentialFieldProcessorStep:
-    """The preprocessor's step with the field of the dataset's actions."""
+    """A new step for the preprocessor, with the field of the dataset's actions."""
     wanted = config.action_feature.shape
     shape = tuple(dataset.meta.features.get(ACTION, {}).get("shape", ()))
     if shape != tuple(wanted):
@@ -156,11 +157,11 @@ def _fitted_step(
     for start in tqdm(starts, desc="Reading actions", unit="block", disable=len(starts) < 2):
         block = frames[start : start + _FRAMES_AT_ONCE]
         actions = torch.from_numpy(np.array(block[ACTION], dtype=np.float32)).reshape(-1, 1, *shape)
-        # No dataset is named: training that goes on from here starts the field afresh, from what it then learns from.
+        # Without a dataset_id, training that continues from this checkpoint fits a new field, to its own data.
         step.demonstrations.observe(
             _normalise(actions, preprocessor), None, torch.from_numpy(block["index"]), settings=settings
         )
-    step.demonstrations.field()  # nothing to observe is an error now rather than at inference
+    step.demonstrations.field()  # raises an error now if the dataset has no actions, not later at inference
     return step
 
 

@@ -36,13 +36,13 @@ Steer = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 class Guide(Protocol):
-    """Bends one integration step."""
+    """Changes one integration step."""
 
     def __call__(self, x_t: Tensor, x_next: Tensor, x_1: Tensor, dt: float) -> Tensor:
         """The guided x_{t+dt}, ``(B, ...)``.
 
         Args:
-            x_t: ``(B, ...)`` where the step begins.
+            x_t: ``(B, ...)`` the start of the step.
             x_next: ``(B, ...)`` the unguided x_{t+dt}.
             x_1: ``(B, ...)`` the end point that the step predicts.
             dt: Length of the step; the steps of one generation add up to 1.
@@ -92,7 +92,7 @@ def flow_matching_loss(
         ``(B, T)`` losses.
     """
     if is_pad is not None:
-        # LeRobot pads with copies of the last action, from which the network could read where the chunk ends.
+        # LeRobot pads with copies of the last action. From these the network could learn where the episode ends.
         x_1 = x_1.masked_fill(is_pad.unsqueeze(-1), 0.0)
     path = sample_path(x_0, x_1, t)
     loss = (velocity(path.x_t, t) - path.velocity).square().mean(dim=-1)  # (B, T)
@@ -112,7 +112,7 @@ def sample_time(
         batch_size: The number B of times.
         distribution: ``uniform``, as in Algorithm 1, or ``beta``: 1 - t ~ Beta(1.5, 1), which puts more weight on the
             noisy end, as pi0 does (Black et al., 2024; there t runs from data to noise).
-        device: Where to put them.
+        device: Device of the times.
         generator: Source of randomness.
 
     Returns:
@@ -146,9 +146,9 @@ def integrate(
         x_0: ``(B, ...)`` starting points.
         num_steps: The number N >= 1 of steps.
         integrator: ``euler`` (first order) or ``midpoint`` (second order).
-        guide: Bends every step; None leaves the flow as it is.
-        steer: Maps ``(B, ...)`` points, ``(B,)`` times and velocities to other velocities. The guide is told the end point
-            that the velocity predicts, not the steered one, which may overshoot it by far.
+        guide: Changes every step; None leaves the flow unchanged.
+        steer: Maps ``(B, ...)`` points, ``(B,)`` times and velocities to other velocities. The guide gets the end point
+            that the original velocity predicts. The end point of a steered velocity may be far beyond it.
 
     Returns:
         ``(B, ...)`` end points.

@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a potential field bends one step of a generative process (Section IV-B of the paper).
+"""How a potential field changes one step of a generative process (Section IV-B of the paper).
 
-Both guides share lambda (`guidance_scale`) and the limit of small lambda. Over a step of dt, one explicit step of
-lambda Phi moves an action by the share lambda dt / h^2 of its mean shift. `euler` takes that step as printed. Beyond a
-share of 1 it overshoots: this is the sensitivity to lambda that the paper reports. `proximal` solves the same equation
+Both guides use lambda (`guidance_scale`) and agree in the limit of small lambda. Over a step of dt, one explicit step of
+lambda Phi moves an action by the share lambda dt / h^2 of its mean shift. `euler` takes that step as printed. With a
+share above 1 it overshoots: this is the sensitivity to lambda that the paper reports. `proximal` solves the same equation
 exactly over the step and cannot overshoot for any lambda.
 
-They also differ in the point at which they ask the field (`guidance_point`). `euler` asks at x_t, as printed. There the
-action still carries the noise that the flow is about to remove, and the guidance removes it a second time. `proximal`
-asks at the end point that the step predicts, which is as clean as the network can tell. With many small steps even the
-point after the step is mostly noise, and a strong guidance there overrules what the network knows.
+They also differ in the point at which they evaluate the field (`guidance_point`). `euler` evaluates it at x_t, as
+printed. There the action still contains the noise that the flow will remove, so the guidance removes it a second time.
+`proximal` evaluates it at the end point that the step predicts. That point has as little noise as the network can
+predict. With many small steps even the point after the step is mostly noise, and strong guidance there overrides what
+the network predicts.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ GUIDANCE_POINTS = ("current", "end", "next")
 
 @dataclass(frozen=True)
 class GuidanceSettings:
-    """How a field bends a process.
+    """The settings with which a field guides a process.
 
     Args:
         scale: lambda, finite and at least 0; 0 is exactly the unguided process.
@@ -37,7 +38,7 @@ class GuidanceSettings:
         point: The point at which the field is evaluated, one of `GUIDANCE_POINTS`: x_t (current), the end point that the
             step predicts (end), or the point after the step (next). None: the integrator's own, current for euler and
             end for proximal.
-        action_dims: The entries of an action that the field covers; the others pass unchanged. None: all.
+        action_dims: The dimensions of an action that the field covers; the others stay unchanged. None: all.
 
     Raises:
         ValueError: If a value breaks its rule. The message names the option of the policy's configuration.
@@ -85,7 +86,7 @@ class ProximalGuide:
 
     With the local mean m held fixed, dx/dt = lambda (m - x) / h^2 has the solution
     x = m + (x - m) exp(-lambda dt / h^2). The distance term pulls with constant strength lambda |alpha| and stops
-    at the safe set. Both move the point at which the field is asked; the step is moved by the same offset.
+    at the safe set. Both are computed for the point at which the field is evaluated. Their offset is added to the step.
 
     Args:
         field: The potential field.
@@ -112,7 +113,7 @@ def make_guide(field: PotentialField, settings: GuidanceSettings) -> Guide | Non
 
     Args:
         field: The potential field, over the dimensions ``settings.action_dims``.
-        settings: How it bends the process.
+        settings: The settings of the guidance.
     """
     if settings.scale == 0:
         return None
@@ -129,7 +130,7 @@ class _OnDimensions:
     """A guide that acts on some of the action dimensions."""
 
     guide: Guide
-    # On the actions' device: copying it there in each step would take longer than the rest.
+    # On the actions' device. Copying it there in each step would take longer than the rest of the call.
     dims: Tensor
 
     def __call__(self, x_t: Tensor, x_next: Tensor, x_1: Tensor, dt: float) -> Tensor:

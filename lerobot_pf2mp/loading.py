@@ -32,7 +32,7 @@ def load_policy(
     Args:
         path: A checkpoint's ``pretrained_model`` folder, or a repository on the Hub.
         revision: Branch, tag or commit on the Hub.
-        device: Where to run, for example ``cuda``; None for the best there is.
+        device: Device of the policy, for example ``cuda``; None for the best available one.
         **overrides: Fields of the policy's configuration to change, for example ``guidance_scale=0.4``.
 
     Returns:
@@ -41,8 +41,8 @@ def load_policy(
     Raises:
         FileNotFoundError: If the path is neither a folder nor the name of a repository.
         OSError: If the checkpoint cannot be read or reached.
-        ValueError: If there is no such option, it cannot have that value, a file is damaged, or guidance is on and there
-            is no potential field for it.
+        ValueError: If an option does not exist or cannot have its value, a file is damaged, or guidance is on without a
+            potential field.
     """
     config = load_config(path, revision=revision, device=device, **overrides)
     path = str(config.pretrained_path)
@@ -71,7 +71,7 @@ def loaded_field(
         preprocessor: Its preprocessor.
 
     Raises:
-        ValueError: If there is none, it is not fitted, or it covers other dimensions than the policy's.
+        ValueError: If there is no field, it is not fitted, or it covers other dimensions than the policy's.
     """
     for step in preprocessor.steps:
         if isinstance(step, PotentialFieldProcessorStep):
@@ -84,7 +84,7 @@ def loaded_field(
 def load_config(
     path: str | Path, *, revision: str | None = None, device: str | None = None, **overrides: Any
 ) -> PreTrainedConfig:
-    """Loads a checkpoint's configuration; the arguments and errors are those of `load_policy`."""
+    """Loads a checkpoint's configuration. The arguments and errors are those of `load_policy`."""
     path = Path(path).expanduser()
     is_repository_name = len(path.parts) == 2 and not path.is_absolute()
     if not path.is_dir() and not is_repository_name:
@@ -106,6 +106,6 @@ def load_config(
                 raise ValueError(f"a {config.type} policy's option must be one of {names}, got {name!r}")
         if options:
             config = PreTrainedConfig.from_pretrained(path, revision=revision, cli_overrides=options)
-    # LeRobot leaves this empty; without it the processors would be built anew, with neither statistics nor field.
+    # LeRobot leaves this empty. It would then create new processors, without statistics and without the field.
     config.pretrained_path = path
     return config

@@ -27,7 +27,7 @@ from lerobot_pf2mp.density.kernel_sums import KernelSums
 from lerobot_pf2mp.density.kernel_tree import KernelTree
 from lerobot_pf2mp.density.kernels import offsets_to_nearest
 
-# What a field is fitted with unless somebody says otherwise.
+# Defaults of `fit`, and of the policies' options.
 BANDWIDTH = "likelihood"
 THRESHOLD_QUANTILE = 0.01
 
@@ -39,7 +39,7 @@ def check_alpha(alpha: float, name: str = "alpha") -> None:
 
     Args:
         alpha: The weight.
-        name: What the user calls it.
+        name: Its name in the error message.
 
     Raises:
         ValueError: If it is not finite or above 0.
@@ -53,7 +53,7 @@ def check_threshold_quantile(quantile: float, name: str = "threshold_quantile") 
 
     Args:
         quantile: The quantile.
-        name: What the user calls it.
+        name: Its name in the error message.
 
     Raises:
         ValueError: If it does not lie in [0, 1].
@@ -111,9 +111,10 @@ class PotentialField:
 
     @cached_property
     def prepared(self) -> PotentialField:
-        """This field, with everything computed that lookups share, which is otherwise done when it is first needed.
+        """This field, after everything is computed that all evaluations share.
 
-        A graph of ``torch.compile`` that is traced before would do it in each call.
+        Otherwise that is computed in the first evaluation. A graph of ``torch.compile`` that is traced before it would
+        compute it in each call.
         """
         self.potential_gradient(self.anchors[:1])
         return self
@@ -144,7 +145,7 @@ class PotentialField:
 
     @torch.no_grad()
     def log_density_and_mean_shift(self, a: Tensor) -> tuple[Tensor, Tensor]:
-        """`log_density` and `mean_shift` of actions ``(..., D)``, ``(...)`` and ``(..., D)``, for the price of one."""
+        """`log_density` ``(...)`` and `mean_shift` ``(..., D)`` of actions ``(..., D)``, at the cost of one of them."""
         shifts, log_sums = self._sums(self._flatten(a))
         return (log_sums - self._log_normaliser).reshape(a.shape[:-1]), shifts.reshape(a.shape)
 
@@ -181,7 +182,7 @@ class PotentialField:
         if self._sums.has_tree:
             offsets = self._sums.tree.offsets_to(self._safe_tree, queries, self._log_sum_threshold)
         else:
-            # Without a look at the values, for which a GPU would have to be waited for.
+            # For all queries: selecting the unsafe ones would have to wait for the GPU.
             is_unsafe = self.log_density(queries) <= self.log_threshold
             offsets = torch.where(
                 is_unsafe.unsqueeze(-1), offsets_to_nearest(queries, self._safe_anchors, self.bandwidth), 0.0
@@ -194,8 +195,8 @@ class PotentialField:
 
         Args:
             a: ``(..., D)`` actions [normalised].
-            share: Which share of the mean shift is taken, in [0, 1].
-            max_distance: Largest distance to move towards H after that [normalised].
+            share: Fraction of the mean shift that the step covers, in [0, 1].
+            max_distance: Largest length of the second part, towards H [normalised].
 
         Returns:
             ``(..., D)`` steps [normalised].
@@ -257,7 +258,7 @@ class PotentialField:
     @cached_property
     def _anchor_is_safe(self) -> Tensor:
         log_densities = self.log_density(self.anchors)  # (M,)
-        # H holds at least the densest anchor, so that every action has somewhere to go.
+        # H contains at least the densest anchor. Otherwise H could be empty.
         return (log_densities > self.log_threshold) | (log_densities == log_densities.max())
 
     @cached_property
@@ -292,7 +293,7 @@ def fit(
         bandwidth: A rule of `BANDWIDTH_RULES`, or h itself [normalised].
         threshold_quantile: The quantile in [0, 1] of the anchors' own log densities that bounds the safe set H.
         alpha: Weight of the distance term, at most 0.
-        n_anchors: How many of the points to keep, drawn without replacement; None keeps them all.
+        n_anchors: Number of points to keep, drawn without replacement; None keeps them all.
         generator: Source of randomness for that draw.
 
     Returns:

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Registers this package with LeRobot and with Gymnasium, at the moment at which each of them is there.
+"""Registers this package with LeRobot and with Gymnasium, as soon as each of them is imported.
 
-The maths needs neither, and LeRobot alone takes several seconds to import. So ``import lerobot_pf2mp`` imports neither. It
-registers at once with those that are imported already, and with the others as soon as somebody imports them:
+The maths needs neither of them, and the import of LeRobot takes several seconds. So ``import lerobot_pf2mp`` imports
+neither. If one of them is already imported, it registers there at once, else directly after the first import of it:
 
     import lerobot_pf2mp              import lerobot.policies
     import lerobot.policies    or     import lerobot_pf2mp        both leave ``pf2mp`` in LeRobot's registries
 
-LeRobot's own package file imports nothing, so that registration right after it meets no module of LeRobot that is half
-imported. Nor may it meet one of ours: packages with modules that register (`policies`, `envs.configs`) import LeRobot
-before any of these modules.
+The registration imports modules of LeRobot and of this package, and none of them may be half imported at that time.
+``lerobot/__init__.py`` imports only its version, so no other module of LeRobot can be. In this package, the packages with
+modules that register (`policies`, `envs.configs`) import LeRobot before any of these modules.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from types import ModuleType
 
 
 def register() -> None:
-    """Registers policies, processor step, optimiser and environments, now or when LeRobot and Gymnasium are imported."""
+    """Registers policies, processor step, optimiser and environments: now, or when LeRobot and Gymnasium are imported."""
     _once_imported("gymnasium", register_gym_environments)
     _once_imported("lerobot", register_with_lerobot)
 
 
 def register_with_lerobot() -> None:
     """Registers policies, the processor step, the optimiser and configurations of environments with LeRobot."""
-    # The decorators of these modules register.
+    # Decorators in these modules do the registration.
     import lerobot_pf2mp.envs.configs.fetch
     import lerobot_pf2mp.envs.configs.handwriting
     import lerobot_pf2mp.envs.configs.maze
@@ -40,7 +40,7 @@ def register_with_lerobot() -> None:
 
 
 def register_gym_environments() -> None:
-    """Registers the environments with Gymnasium; MuJoCo is imported when one is made."""
+    """Registers the environments with Gymnasium. MuJoCo is imported only when an environment is created."""
     import gymnasium
 
     from lerobot_pf2mp.envs import tasks
@@ -69,7 +69,7 @@ def register_gym_environments() -> None:
 
 
 def _once_imported(package: str, call: Callable[[], None]) -> None:
-    """Calls a function now if a package is imported, else right after its first import."""
+    """Calls a function now if a package is imported, else directly after its first import."""
     if sys.modules.get(package) is not None:
         call()
     else:
@@ -77,7 +77,7 @@ def _once_imported(package: str, call: Callable[[], None]) -> None:
 
 
 class _Watch(MetaPathFinder):
-    """Waits in ``sys.meta_path`` for the import of one package, which the other finders find as ever."""
+    """A finder in ``sys.meta_path`` that waits for the import of one package. The other finders find the package."""
 
     def __init__(self, package: str, call: Callable[[], None]) -> None:
         self._package = package
@@ -101,7 +101,7 @@ class _Watch(MetaPathFinder):
 
 
 class _LoaderThenCall(Loader):
-    """Loads a module as its own loader does, which it gets back, and then calls a function."""
+    """Loads a module with the module's own loader and then calls a function. The module keeps only its own loader."""
 
     def __init__(self, loader: Loader, call: Callable[[], None]) -> None:
         self._loader = loader

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The entry points of the commands, one file each in `commands`.
+"""The entry points of the commands. Each command has its own file in `commands`.
 
-All but that of pf2mp-info, which is in `_info` because it has to run where this package cannot be imported.
+Only the entry point of pf2mp-info is in `_info`, because that command must run even if this package cannot be imported.
 """
 
 from lerobot_pf2mp.commands.command import run

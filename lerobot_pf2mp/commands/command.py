@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the commands have in common: how they begin and end, and where datasets go."""
+"""Code shared by the commands: how they start and end, and the folders of the datasets that they write."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ import draccus
 from lerobot_pf2mp import __version__
 from lerobot_pf2mp.process.interruption import exit_code, sigterm_like_ctrl_c
 
-# Options under earlier names, which go on working.
+# Earlier names of options. They still work.
 _RENAMED = {"--picture_width": "--image_width"}
 
 
 def answer_version() -> None:
-    """Prints the version and ends the process if the command line is ``--version``, before anything large is imported."""
+    """Prints the version and ends the process if the command line is ``--version``. Large imports come only later."""
     if sys.argv[1:] == ["--version"]:
         print(f"{Path(sys.argv[0]).name} {__version__}")
         sys.exit()
 
 
 def run(config_class: type, main: Callable[[Any], None]) -> None:
-    """Parses the command line and runs a command; whatever a user can cause ends in one line and a non-zero code."""
+    """Parses the command line and runs a command. Errors that users can cause print one line and exit with code 1."""
     answer_version()
     for number, argument in enumerate(sys.argv):
         name, equals, value = argument.partition("=")
@@ -56,7 +56,7 @@ def given[T](option: str, value: T | None) -> T:
     """The value of an option that must be given.
 
     Raises:
-        ValueError: If it was not.
+        ValueError: If it was not given.
     """
     if value is None:
         raise ValueError(f"{option} must be given")
@@ -64,7 +64,7 @@ def given[T](option: str, value: T | None) -> T:
 
 
 def dataset_name_and_root(repo_id: str | None, root: Path | None, name: str) -> tuple[str, Path]:
-    """Name and folder of a dataset; by default local/NAME, and where LeRobot keeps datasets."""
+    """The name and the folder of a dataset. By default these are local/NAME and LeRobot's folder for that name."""
     from lerobot.utils.constants import HF_LEROBOT_HOME
 
     repo_id = repo_id or f"local/{name}"
@@ -83,13 +83,14 @@ class DatasetOptions(Protocol):
 def write_and_report(
     options: DatasetOptions, name: str, n_steps: int, write: Callable[..., tuple[int, Counter[str]]]
 ) -> None:
-    """Writes a dataset where the options say, and says what was written and what was left out.
+    """Writes a dataset and prints how many episodes were written and how many were left out.
 
     Args:
         options: The command's options.
-        name: The dataset is local/NAME, where LeRobot keeps datasets, unless the options say otherwise.
-        n_steps: Steps of an episode, unless the options say otherwise.
-        write: Is given root, repo_id, n_steps and overwrite; returns the number of episodes, and by reason those left out.
+        name: Default of the dataset's name, which is then local/NAME in LeRobot's folder.
+        n_steps: Default of the number of steps of an episode.
+        write: Function of root, repo_id, n_steps and overwrite. It returns the number of written episodes, and the numbers
+            of omitted ones by reason.
     """
     repo_id, root = dataset_name_and_root(options.repo_id, options.root, name)
     n_steps = n_steps if options.n_steps is None else options.n_steps

@@ -60,9 +60,9 @@ class FitFieldConfig:
 --output_dir=outputs/pf2mp
     """
 
-    # The policy.
+    # The policy that gets a field.
     policy: FitFieldPolicyConfig = field(default_factory=FitFieldPolicyConfig)
-    # The demonstrations.
+    # The dataset of demonstrations.
     dataset: FitFieldDatasetConfig = field(default_factory=FitFieldDatasetConfig)
     # Folder of the new checkpoint.
     output_dir: Path | None = None

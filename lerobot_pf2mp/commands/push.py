@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 class PushConfig:
     """Publishes a checkpoint on the Hugging Face Hub, with a model card, in one commit.
 
-    The checkpoint is loaded first: one that is damaged, or a guided policy whose potential field is missing, is not
-    published. You must be logged in (hf auth login, or the variable HF_TOKEN).
+    The checkpoint is loaded first. It is not published if it is damaged, or if it is a guided policy without its potential
+    field. You must be logged in (hf auth login, or the variable HF_TOKEN).
 
     Examples:
         pf2mp-push --path=outputs/MazeLarge-v0/pf2mp_0/checkpoints/last/pretrained_model --repo_id=you/pf2mp_maze_large
@@ -28,7 +28,7 @@ class PushConfig:
 
     # The checkpoint's pretrained_model folder.
     path: Path | None = None
-    # Where to publish it, user/name.
+    # Repository to publish to, user/name.
     repo_id: str | None = None
     # Whether a new repository is private.
     private: bool | None = None
@@ -38,7 +38,7 @@ class PushConfig:
     figures: list[Path] = field(default_factory=list)
     # Name of the dataset on the Hub; by default the one that the policy was trained on.
     dataset: str | None = None
-    # Branch to publish to, made if there is none; by default main.
+    # Branch to publish to, created if it does not exist; by default main.
     branch: str | None = None
 
 
@@ -61,10 +61,10 @@ def main(config: PushConfig) -> None:
 
 
 def _loaded_facts(path: Path) -> PolicyFacts:
-    """What the card says of a checkpoint, which is loaded whole: a damaged one is not published.
+    """The facts about a checkpoint for its card. All of the checkpoint is loaded, so that a damaged one is not published.
 
     Raises:
-        ValueError: If the checkpoint is of a policy that is not of this package, or damaged.
+        ValueError: If the checkpoint is damaged, or its policy is not of this package.
         OSError: If it cannot be read.
     """
     from lerobot_pf2mp.hub.model_card import POLICY_NAMES

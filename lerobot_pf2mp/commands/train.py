@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command pf2mp-train. It has one option of its own; the others are those of lerobot-train."""
+"""The command pf2mp-train. It adds one option to those of lerobot-train."""
 
 from __future__ import annotations
 

@@ -46,12 +46,12 @@ _UNGUIDED_LIMITS = ("It imitates the demonstrations and knows nothing of obstacl
 
 @dataclass(frozen=True)
 class GuidanceFacts:
-    """What a card says of a policy's guidance.
+    """The facts about a policy's guidance for its card.
 
     Args:
         scale: lambda.
         integrator: proximal or euler.
-        point: The point at which the field is asked; None for the integrator's own.
+        point: The point at which the field is evaluated; None for the integrator's own.
         action_dims: The action dimensions that the field covers; None for all.
         alpha: Weight of the distance term [1/normalised].
         bandwidth_rule: The rule by which the bandwidth was chosen; None for a given number.
@@ -71,18 +71,18 @@ class GuidanceFacts:
 
 @dataclass(frozen=True)
 class PolicyFacts:
-    """What a card says of a policy.
+    """The facts about a policy for its card.
 
     Args:
         type: Its registered name, one of `POLICY_NAMES`.
         inputs: Shapes of the input features by name.
         outputs: Shapes of the output features by name.
         horizon: Actions predicted at once.
-        n_action_steps: Actions executed of them.
+        n_action_steps: Number of these actions that are executed.
         num_inference_steps: Integration or denoising steps N.
         guidance: Its guidance; None for an unguided policy.
         license: Name of the licence; None for the default.
-        tags: Further tags.
+        tags: More tags.
     """
 
     type: str
@@ -153,7 +153,7 @@ def make_model_card(facts: CardFacts) -> ModelCard:
 
 
 def env_options(env: Mapping[str, Any] | None) -> list[str]:
-    """The options by which lerobot-eval makes an environment: type, task and what differs from the defaults.
+    """The options of lerobot-eval for an environment: its type, its task, and all values that differ from the defaults.
 
     Args:
         env: LeRobot's configuration of the environment as a dictionary; None if unknown.
@@ -175,7 +175,7 @@ def env_options(env: Mapping[str, Any] | None) -> list[str]:
 
 
 def _is_on_the_hub(dataset: str | None) -> bool:
-    """Whether a dataset's name can be one of the Hub's; those of this package's commands are local/... by default."""
+    """Whether a dataset's name can be a name on the Hub. By default, this package's commands use names local/... ."""
     return bool(dataset and dataset.count("/") == 1 and not dataset.startswith("local/"))
 
 
@@ -191,7 +191,7 @@ def _usage(facts: CardFacts) -> str:
 lerobot-eval --policy.path={facts.repo_id} {env} \\
     --eval.n_episodes=50 --eval.batch_size=10
 
-# train one like it, or go on from this one
+# train a new one like it, or continue the training of this one
 lerobot-train --policy.type={kind} --dataset.repo_id={dataset} --policy.repo_id=you/your_{kind}
 lerobot-train --policy.path={facts.repo_id} --dataset.repo_id={dataset} --policy.repo_id=you/your_{kind}
 ```
@@ -249,7 +249,7 @@ def _describe_dataset(facts: CardFacts) -> str:
 
 
 def _describe_guidance(guidance: GuidanceFacts) -> list[tuple[str, str]]:
-    point = f", field asked at: {guidance.point}" if guidance.point else ""
+    point = f", field evaluated at: {guidance.point}" if guidance.point else ""
     rows = [
         ("guidance strength lambda", f"{guidance.scale:g}"),
         ("guidance integrator", f"{guidance.integrator}{point}"),
@@ -286,7 +286,7 @@ def _results(facts: CardFacts) -> list[str]:
 
 
 def _show(figure: str, repo_id: str) -> str:
-    """An image, or a video, for which the Hub wants a full address."""
+    """An image or a video as Markdown. The Hub needs a full address for videos."""
     path = PurePosixPath(figure)
     if path.suffix == ".mp4":
         return f'<video controls src="https://huggingface.co/{repo_id}/resolve/main/{figure}"></video>'

@@ -20,7 +20,7 @@ _RESULTS_FILES = ("summary.csv", "table.md", "run.json")
 
 @dataclass(frozen=True)
 class _Results:
-    """What a card says of a benchmark."""
+    """The results of a benchmark for a card."""
 
     table: str
     made_with: Mapping[str, str]
@@ -43,12 +43,12 @@ def publish_checkpoint(
     Args:
         path: The checkpoint's ``pretrained_model`` folder.
         repo_id: The repository, ``user/name``.
-        policy: What the card says of the policy.
-        results: A folder that `run_benchmark` has written; None for ``results`` in the checkpoint, if it is there.
+        policy: The facts about the policy for the card.
+        results: A folder that `run_benchmark` has written; None for ``results`` in the checkpoint, if that exists.
         figures: Images and videos for the card.
         dataset: Name of the dataset on the Hub; None for the one named in the checkpoint's training configuration.
         private: Whether a new repository is private; None for the Hub's default.
-        branch: Branch, which is made if there is none; None for main.
+        branch: Branch, created if it does not exist; None for main.
 
     Returns:
         The repository's address.

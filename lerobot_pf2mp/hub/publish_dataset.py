@@ -15,9 +15,9 @@ _FRAMES = [{"config_name": "default", "data_files": "data/*/*.parquet"}]
 
 
 def publish_dataset(root: Path, repo_id: str, *, private: bool | None = None) -> str:
-    """Publishes a LeRobotDataset with its card, in one commit under the tag by which LeRobot looks for it.
+    """Publishes a LeRobotDataset with its card, in one commit with the tag that LeRobot looks up.
 
-    Frames and videos of an earlier state of the repository are removed, as LeRobot would read them too.
+    Frames and videos of an earlier state of the repository are removed, because LeRobot would read them too.
 
     Args:
         root: The dataset's folder.
@@ -38,7 +38,7 @@ def publish_dataset(root: Path, repo_id: str, *, private: bool | None = None) ->
         if path.is_file()
     }
     card = DatasetCard((root / "README.md").read_text(encoding="utf-8"))
-    card.data["configs"] = _FRAMES  # what the Hub shows as a table
+    card.data["configs"] = _FRAMES  # the files that the Hub shows as a table
     files["README.md"] = str(card).encode()
     return publish(
         repo_id,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publishes files on the Hugging Face Hub: all of them in one commit, so that nobody ever loads half of them."""
+"""Publishes files on the Hugging Face Hub. All go into one commit, so that nobody can download half of them."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from lerobot_pf2mp.errors import explained
 
 
 def check_destination(repo_id: str | None) -> str:
-    """Checks all that can be known before there is anything to publish.
+    """Checks the name of a repository and the login. Both can be checked before there is anything to publish.
 
     Args:
-        repo_id: Where to publish.
+        repo_id: The repository.
 
     Returns:
-        The same.
+        The same name.
 
     Raises:
         ValueError: If it is not of the form ``user/name``.
-        OSError: If nobody is logged in, or the Hub cannot be reached.
+        OSError: If the user is not logged in, or the Hub cannot be reached.
     """
     rule = f"--repo_id must be the name of a repository on the Hub, user/name, got {repo_id}"
     user, slash, name = (repo_id or "").partition("/")
@@ -52,17 +52,17 @@ def publish(
     tag: str | None = None,
     owned_folders: Iterable[str] = (),
 ) -> str:
-    """Publishes files in one commit to a repository, which is made if there is none.
+    """Publishes files in one commit to a repository, which is created if it does not exist.
 
     Args:
         repo_id: The repository, ``user/name``.
-        repo_type: What it holds.
+        repo_type: Type of the repository.
         files: Files or their contents, by path in the repository.
         message: First line of the commit's message.
         private: Whether a new repository is private; None for the Hub's default.
-        branch: Branch, which is made if there is none; None for main.
-        tag: A tag to put on the commit, taken from another one if need be.
-        owned_folders: Folders of the repository in which files that are not among `files` are removed.
+        branch: Branch, created if it does not exist; None for main.
+        tag: A tag for the commit. If another commit has this tag, the tag is moved.
+        owned_folders: Folders of the repository. Files in them that are not in `files` are removed.
 
     Returns:
         The repository's address.

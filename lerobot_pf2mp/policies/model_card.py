@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The model card of a policy of this package, as LeRobot asks for it when it publishes a checkpoint."""
+"""The model card with which LeRobot publishes a checkpoint of a policy of this package."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from lerobot_pf2mp.potential_field import PotentialField
 
 
 class WithModelCard:
-    """A policy that is published with a card of this package, to be mixed into LeRobot's policies before their own class.
+    """A mixin for policies that are published with a card of this package. It must come before LeRobot's policy class.
 
-    LeRobot 0.6 asks the policy for its card. Should a later one not ask, its own card is published.
+    LeRobot 0.6 calls `generate_model_card`. If a later version does not call it, LeRobot's own card is published.
     """
 
     config: Any
@@ -33,7 +33,7 @@ class WithModelCard:
         dataset_meta: Any = None,
         **_: Any,
     ) -> ModelCard:
-        """The card; the arguments are those of LeRobot's `PreTrainedPolicy.generate_model_card`."""
+        """The card. The arguments are those of LeRobot's `PreTrainedPolicy.generate_model_card`."""
         training = {} if cfg is None else cfg.to_dict()
         facts = CardFacts(
             policy=policy_facts(self.config, self._trained_field(), license, tags),
@@ -46,11 +46,11 @@ class WithModelCard:
         return make_model_card(facts)
 
     def _trained_field(self) -> PotentialField | None:
-        """The field of the actions that the policy was just trained on; None if it has none."""
+        """The field of the actions on which the policy was just trained; None without a fitted field."""
         guidance: FieldGuidance | None = getattr(self, "guidance", None)
         demonstrations = None if guidance is None else guidance.demonstrations
         if demonstrations is not None:
-            with suppress(ValueError):  # not fitted, as in a training of no steps
+            with suppress(ValueError):  # not fitted, for example after a training of 0 steps
                 return demonstrations.field(self.config.field_settings)
         return None
 
@@ -61,13 +61,13 @@ def policy_facts(
     license: str | None = None,
     tags: Sequence[str] | None = None,
 ) -> PolicyFacts:
-    """What a card says of a policy of this package.
+    """The facts about a policy of this package for its card.
 
     Args:
         config: Its configuration.
-        field: Its potential field; None if it has none, or none that is fitted.
+        field: Its potential field; None without a fitted field.
         license: Name of the licence; None for that of the configuration.
-        tags: Further tags; None for those of the configuration.
+        tags: More tags; None for those of the configuration.
     """
     inputs, outputs = (
         {name: tuple(feature.shape) for name, feature in (features or {}).items()}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Policies whose networks are trained whole."""
+"""Policies that are trained without adapters (PEFT)."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from typing import Any, NoReturn
 
 
 class WithoutPEFT:
-    """A policy that refuses the adapters of ``lerobot-train --peft.*``; to be mixed in before its own class.
+    """A mixin that refuses the adapters of ``lerobot-train --peft.*``. It must come before LeRobot's policy class.
 
-    Adapters are for networks that are too large to be trained whole. A moving average of the weights, as in `fmp`, would
-    average an adapter's two factors rather than their product.
+    Adapters are for networks that are too large to train all weights. A moving average of the weights, as in `fmp`, would
+    average the two factors of an adapter and not their product.
     """
 
     name: str
 
     def wrap_with_peft(self, *args: Any, **kwargs: Any) -> NoReturn:
-        """Refuses, whatever the adapters.
+        """Refuses all adapters.
 
         Raises:
             ValueError: Always.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
 """LeRobot's configurations of the environments (``--env.type=...``), by task."""
 
-# Before any module of this folder, because the import of LeRobot imports them all (see `registration`).
+# LeRobot must come before any module of this folder, because its import imports all of them (see `registration`).
 import lerobot  # noqa: F401

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What LeRobot's configurations of our environments (``--env.type=...``) have in common."""
+"""The base class of LeRobot's configurations of our environments (``--env.type=...``)."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from lerobot_pf2mp.errors import ConfigError
 
 @dataclass
 class CollisionEnvConfig(EnvConfig):
-    """An environment that reports collisions.
+    """Configuration of an environment that reports collisions.
 
     Args:
-        features_map: What LeRobot calls each feature; an environment need not have all of them.
-        obs_type: state, or pixels_agent_pos: rendered images instead of the environment's state, beside the robot's.
+        features_map: LeRobot's name of each feature. An environment does not need to have all of them.
+        obs_type: state (of the robot and of the environment) or pixels_agent_pos (state of the robot and rendered images).
     """
 
     features_map: dict[str, str] = field(
@@ -47,8 +47,8 @@ class CollisionEnvConfig(EnvConfig):
     ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """The vectorised environment, ``{type: {0: env}}``.
 
-        Finished sub-environments are frozen until the next rollout. LeRobot's default resets them at once and then
-        counts the first reward of the next episode, here a collision, into the finished one.
+        Finished sub-environments are frozen until the next rollout. LeRobot's default resets them at once. It then adds
+        the first reward of the next episode, here a collision, to the finished episode.
         """
         # The prefix makes a worker process import the module that registers the environment.
         make_env = partial(
@@ -74,12 +74,12 @@ class CollisionEnvConfig(EnvConfig):
         """Sets `features`.
 
         Args:
-            action_dim: Of the action and, as actions are positions, of the robot's state.
-            environment_dim: Of the environment's state; 0 without one.
+            action_dim: Dimension of the action. The robot's state has the same one, because actions are positions.
+            environment_dim: Dimension of the environment's state; 0 without one.
             image_size: Height and width of rendered images [pixels].
 
         Raises:
-            ConfigError: If there is no such `obs_type`.
+            ConfigError: If `obs_type` does not exist.
         """
         if self.obs_type not in OBS_TYPES:
             raise ConfigError(f"obs_type must be one of {list(OBS_TYPES)}, got {self.obs_type!r}")

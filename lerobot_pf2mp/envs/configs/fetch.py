@@ -24,14 +24,14 @@ class PF2MPFetchEnv(CollisionEnvConfig):
     Args:
         task: FetchReachWall-v0 or FetchPushWall-v0.
         fps: Control frequency [Hz]; follows from `n_inner_steps`.
-        episode_length: Steps after which an episode ends.
-        wall_position: x, y of the wall's centre [m]; by default, as below, the task's.
-        wall_size: Its sides [m].
-        start_range: Two opposite corners x, y, z of where the gripper starts [m].
-        goal_range: The same of the goal [m]; for FetchPushWall-v0 x and y only.
-        block_range: The same of the block, x and y [m].
+        episode_length: Number of steps after which an episode ends.
+        wall_position: x, y of the wall's centre [m]. None is the task's own value, also for the next four options.
+        wall_size: Lengths of the wall's sides [m].
+        start_range: Two opposite corners x, y, z of the box of start positions of the gripper [m].
+        goal_range: The same for the goal [m]; for FetchPushWall-v0 x and y only.
+        block_range: The same for the block, x and y [m]; for FetchPushWall-v0 only.
         n_inner_steps: Steps of the inner loop for each action, 0.04 s each.
-        terminate_on_success: Whether an episode ends at the goal rather than after `episode_length` steps.
+        terminate_on_success: Whether an episode ends at the goal and not only after `episode_length` steps.
         render_size: Width of the rendered image [pixels].
     """
 
@@ -51,7 +51,7 @@ class PF2MPFetchEnv(CollisionEnvConfig):
         """Validates the task and its scene.
 
         Raises:
-            ConfigError: If there is no such task, or the scene does not work.
+            ConfigError: If the task does not exist, or its scene is not possible.
         """
         if self.task not in FETCH_TASKS:
             raise ConfigError(f"task must be one of {list(FETCH_TASKS)}, got {self.task!r}")

@@ -26,12 +26,12 @@ class PF2MPHandwritingEnv(CollisionEnvConfig):
     Args:
         task: HandwritingJoint-v0 (joint positions) or HandwritingPen-v0 (positions of the pen's tip).
         fps: Control frequency [Hz], a divisor of 500.
-        episode_length: Steps after which an episode ends.
-        letter: What to write, one of `letters.LETTERS`.
-        letter_height: [m].
-        region_gap: Between the letter and the restricted regions [m].
-        n_regions: How many regions are put into the letter's bays.
-        scene_file: A JSON file with a stroke and regions of your own instead of a letter.
+        episode_length: Number of steps after which an episode ends.
+        letter: Letter to write, one of `letters.LETTERS`.
+        letter_height: Height of the letter [m].
+        region_gap: Distance between the letter and the restricted regions [m].
+        n_regions: Largest number of restricted regions in the concave parts of the letter.
+        scene_file: A JSON file with your own stroke and regions instead of a letter.
         control: physics (position controllers in full physics) or exact (the arm reaches every action).
         render_size: Width of the rendered image [pixels].
         camera: arm (from the side) or top (the sheet alone).
@@ -53,7 +53,7 @@ class PF2MPHandwritingEnv(CollisionEnvConfig):
         """Validates the task and its scene.
 
         Raises:
-            ConfigError: If there is no such task, or the scene does not work.
+            ConfigError: If the task does not exist, or its scene is not possible.
         """
         if self.task not in HANDWRITING_TASKS:
             raise ConfigError(f"task must be one of {list(HANDWRITING_TASKS)}, got {self.task!r}")

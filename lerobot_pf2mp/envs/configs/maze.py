@@ -21,12 +21,13 @@ class PF2MPMazeEnv(CollisionEnvConfig):
     Args:
         task: MazeUMaze-v0, MazeMedium-v0 or MazeLarge-v0.
         fps: Control frequency [Hz].
-        episode_length: Steps after which an episode ends.
-        maze_map: A map of your own instead of the task's: rows of 0 (free) and 1 (wall) separated by "/", for example
+        episode_length: Number of steps after which an episode ends.
+        maze_map: Your own map instead of the task's: rows of 0 (free) and 1 (wall) separated by "/", for example
             11111/10001/11111.
         control: exact (the ball reaches each action) or pd (a PD controller drives it in full physics).
-        collision_radius: What must not touch a wall [m]: 0.1 is the ball, 0 its centre.
-        terminate_on_success: Whether an episode ends at the goal rather than after `episode_length` steps.
+        collision_radius: Radius around the ball's centre that must not touch a wall [m]: 0.1 is the whole ball, 0 only the
+            centre.
+        terminate_on_success: Whether an episode ends at the goal and not only after `episode_length` steps.
         render_size: Longer side of the rendered image [pixels].
     """
 
@@ -43,7 +44,7 @@ class PF2MPMazeEnv(CollisionEnvConfig):
         """Validates the task.
 
         Raises:
-            ConfigError: If there is no such task.
+            ConfigError: If the task does not exist, or its map or image is not possible.
         """
         if self.task not in MAZE_TASKS:
             raise ConfigError(f"task must be one of {list(MAZE_TASKS)}, got {self.task!r}")

@@ -15,8 +15,8 @@ from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
 class DPPFConfig(GuidedConfig, DiffusionConfig):
     """Configuration of DPPF (Section V of the paper): LeRobot's Diffusion Policy with PF2MP's guidance.
 
-    The arguments are those of LeRobot's `DiffusionConfig` and of `GuidedConfig`. The defaults differ from the former in
-    the sampler, as in the paper's comparison:
+    The arguments are those of LeRobot's `DiffusionConfig` and of `GuidedConfig`. Two defaults of the sampler differ from
+    `DiffusionConfig`, as in the paper's comparison:
 
     Args:
         noise_scheduler_type: DDIM (deterministic, for few steps) or DDPM.

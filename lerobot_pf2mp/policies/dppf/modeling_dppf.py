@@ -20,10 +20,10 @@ from lerobot_pf2mp.policies.without_peft import WithoutPEFT
 
 
 class DPPFPolicy(WithoutPEFT, WithModelCard, DiffusionPolicy):
-    """Differs from `DiffusionPolicy` in three points, like `PF2MPPolicy` from `FMPPolicy`.
+    """`DiffusionPolicy` with a potential field. It adds to it what `PF2MPPolicy` adds to `FMPPolicy`.
 
-    These are what training shows the field, the bent denoising, and the checked plan. The weights are those of
-    `DiffusionPolicy`, and with ``guidance_scale=0`` so are the actions.
+    Training also adds its actions to the field, the guide changes every denoising step, and each chunk is checked. The
+    weights are those of `DiffusionPolicy`, and with ``guidance_scale=0`` so are the actions.
 
     Args:
         config: The policy's configuration.
@@ -42,12 +42,12 @@ class DPPFPolicy(WithoutPEFT, WithModelCard, DiffusionPolicy):
         dataset_meta: Any = None,
         **kwargs: Any,
     ) -> None:
-        # Before the set-up of DiffusionPolicy, which ends in `reset`.
+        # Before DiffusionPolicy.__init__, which calls `reset`.
         self.guidance = FieldGuidance(config, dataset_stats)
         super().__init__(config, **kwargs)
 
     def forward(self, batch: dict[str, Any], *args: Any, **kwargs: Any) -> tuple[Tensor, None]:
-        """The loss of `DiffusionPolicy`; in training, the batch's actions also go to the potential field."""
+        """The loss of `DiffusionPolicy`. In training it also adds the batch's actions to the potential field."""
         if self.training and torch.is_grad_enabled():
             self.guidance.observe(batch)
         return super().forward(batch, *args, **kwargs)
@@ -56,13 +56,13 @@ class DPPFPolicy(WithoutPEFT, WithModelCard, DiffusionPolicy):
     def predict_action_chunk(
         self, batch: dict[str, Any], noise: Tensor | None = None, guide: Guide | None = None
     ) -> Tensor:
-        """The chunk of `DiffusionPolicy`, every denoising step bent by the guide, and then checked.
+        """The chunk of `DiffusionPolicy` with a guide in every denoising step. The chunk is then checked.
 
         Args:
             batch: Normalised observations, as for `DiffusionPolicy.predict_action_chunk`, with the potential field. Without
-                past `select_action` calls, a single frame stands for the whole window.
+                past `select_action` calls, a single frame is repeated for the whole window.
             noise: ``(B, horizon, action_dim)`` the sample to denoise; drawn from N(0, I) if None.
-            guide: Bends every denoising step instead of the configured guidance; None for that.
+            guide: The guide to use instead of the configured one; None for the configured one.
 
         Raises:
             ValueError: If there is guidance, or a check, and the batch holds no field or one over other dimensions.
@@ -73,7 +73,7 @@ class DPPFPolicy(WithoutPEFT, WithModelCard, DiffusionPolicy):
         return self.guidance.check(batch, chunk)
 
     def reset(self) -> None:
-        """Forgets past observations and planned actions; to be called when an episode begins."""
+        """Forgets past observations and planned actions. Must be called at the start of an episode."""
         super().reset()
         self.guidance.reset()
 
@@ -105,9 +105,9 @@ class DPPFPolicy(WithoutPEFT, WithModelCard, DiffusionPolicy):
 
 
 class _GuidedScheduler:
-    """A noise scheduler of diffusers, every step of which is bent by a guide.
+    """A noise scheduler of diffusers with a guide in every step.
 
-    Each of the N denoising steps counts as dt = 1/N of the guidance, as the flow's do.
+    For the guidance, each of the N denoising steps has the length dt = 1/N, as in the flow.
     """
 
     def __init__(self, scheduler: Any, guide: Guide) -> None:

@@ -22,7 +22,7 @@ class FMPConfig(PreTrainedConfig):
     inputs, and "action" is the output. Actions should be positions rather than displacements: see `PF2MPConfig`.
 
     Args:
-        n_obs_steps: Observations given to the policy, the current one included.
+        n_obs_steps: Number of observations that the policy gets, including the current one.
         horizon: Actions predicted at once (T_a in the paper), counted from the oldest observation. A multiple of
             2^(len(down_dims) - 1), the U-Net's downsampling.
         n_action_steps: Predicted actions executed before the next prediction; at most horizon - n_obs_steps + 1.
@@ -30,14 +30,14 @@ class FMPConfig(PreTrainedConfig):
             on complete chunks only, which is the paper's setting for episodes resampled to `horizon` steps.
         normalization_mapping: How each kind of feature is normalised.
         vision_backbone: A torchvision ResNet.
-        resize_shape: (H, W) that images are resized to; None leaves them.
+        resize_shape: (H, W) to which images are resized [pixels]; None does not resize.
         crop_ratio: Crop size as a fraction of `resize_shape`; 1 does not crop.
         crop_shape: (H, W) of the crop [pixels]; follows from `resize_shape` and `crop_ratio` if those are given.
         crop_is_random: Whether training crops at random positions; evaluation always crops the centre.
         pretrained_backbone_weights: Torchvision weights to start from; None starts at random.
         use_group_norm: Whether group norm replaces batch norm in the backbone.
         spatial_softmax_num_keypoints: Keypoints for each image.
-        use_separate_rgb_encoder_per_camera: Whether every camera has an encoder of its own.
+        use_separate_rgb_encoder_per_camera: Whether every camera has its own encoder.
         down_dims: Channels of the U-Net's levels. The paper uses (512, 256, 128).
         kernel_size: Width of the U-Net's convolutions.
         n_groups: Groups of the U-Net's group norm; divides every entry of `down_dims`.
@@ -52,11 +52,12 @@ class FMPConfig(PreTrainedConfig):
         time_sampling: Training times: uniform (the paper) or beta (more weight on the noisy end).
         do_mask_loss_for_padding: Whether the loss leaves out actions beyond the end of their episode.
         use_ema: Whether evaluation and checkpoints use an exponential moving average of the weights.
-        ema_decay: Its decay for each step; the first steps use (1 + n) / (10 + n), so that it forgets its start.
+        ema_decay: Decay of that average for each step. Early steps n use (1 + n) / (10 + n), so that the average soon
+            forgets the initial weights.
         optimizer_lr: Learning rate of AdamW at the end of the warm-up.
-        optimizer_betas: Its betas.
-        optimizer_eps: Its epsilon.
-        optimizer_weight_decay: Its weight decay.
+        optimizer_betas: Betas of AdamW.
+        optimizer_eps: Epsilon of AdamW.
+        optimizer_weight_decay: Weight decay of AdamW.
         optimizer_grad_clip_norm: Largest norm of the gradient.
         scheduler_warmup_steps: Steps of linear warm-up, after which a cosine takes the learning rate to zero.
     """
@@ -180,10 +181,10 @@ class FMPConfig(PreTrainedConfig):
             self.crop_shape = (int(height * self.crop_ratio), int(width * self.crop_ratio))
 
     def validate_features(self) -> None:
-        """Checks the input and output features, once they are known.
+        """Checks the input and output features. They are not known before a dataset or an environment is.
 
         Raises:
-            ValueError: If there is nothing to observe, no action, or images that do not fit.
+            ValueError: If there is no observation or no action, or the images do not fit.
         """
         if self.action_feature is None:
             raise ValueError(f"output_features must hold 'action', got {list(self.output_features or {})}")
@@ -220,7 +221,8 @@ class FMPConfig(PreTrainedConfig):
     def observation_delta_indices(self) -> list[int] | None:
         """Offsets of the observed frames [steps]; None for the current frame alone.
 
-        With None the loader reads no observation window, a third of its time, and observations arrive as ``(B, D)``.
+        With None the loader reads no observation window, which saves a third of its time. Observations then have the shape
+        ``(B, D)``.
         """
         return None if self.n_obs_steps == 1 else list(range(1 - self.n_obs_steps, 1))
 

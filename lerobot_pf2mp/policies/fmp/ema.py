@@ -10,13 +10,13 @@ from torch import Tensor, nn
 
 
 class MovingAverage(nn.Module):
-    """A frozen copy of a network that becomes the moving average of its weights, and stays in evaluation mode.
+    """A frozen copy of a network. Its weights are the moving average of the network's, and it stays in evaluation mode.
 
     The count of updates is a buffer beside the averaged weights, so saving and loading the state resumes the average
     exactly. The state has the keys of PyTorch's ``AveragedModel``, whose update takes many times longer.
 
     Args:
-        network: The network to follow.
+        network: The network whose weights are averaged.
         decay: Largest decay for each update; update n uses min(decay, (1 + n) / (10 + n)), and the first one takes the
             weights as they are.
     """
@@ -28,14 +28,14 @@ class MovingAverage(nn.Module):
         self.module = copy.deepcopy(network).requires_grad_(False).eval()
         self.register_buffer("n_averaged", torch.tensor(0))
         self._decay = decay
-        # Walking through the modules takes longer than averaging.
+        # Lists of the weights, because collecting them from the modules takes longer than averaging.
         self._averaged: list[Tensor] = []
         self._followed: list[Tensor] = []
         self._has_buffers = next(network.buffers(), None) is not None
 
     @torch.no_grad()
     def update_parameters(self, network: nn.Module) -> None:
-        """Moves the average towards the weights of the network; buffers are copied."""
+        """Moves the average towards the weights of the network. Buffers are copied."""
         if not self._followed or next(network.parameters()) is not self._followed[0]:
             self._averaged = list(self.module.parameters())
             self._followed = list(network.parameters())
@@ -51,5 +51,5 @@ class MovingAverage(nn.Module):
         self.n_averaged += 1
 
     def train(self, mode: bool = True) -> MovingAverage:
-        """Nothing: the average is for evaluation."""
+        """Changes nothing: the average is only for evaluation."""
         return self

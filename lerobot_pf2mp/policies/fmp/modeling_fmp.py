@@ -74,28 +74,28 @@ class FMPPolicy(WithoutPEFT, WithModelCard, PreTrainedPolicy):
         return self.network.parameters()
 
     def update(self) -> None:
-        """Takes the weights into their moving average; LeRobot calls this after every optimiser step."""
+        """Updates the moving average of the weights. LeRobot calls this after every optimiser step."""
         if self.ema is not None:
             self.ema.update_parameters(self.network)
 
     def reset(self) -> None:
-        """Forgets past observations and planned actions; to be called when an episode begins."""
+        """Forgets past observations and planned actions. Must be called at the start of an episode."""
         self._queues: dict[str, deque[Tensor]] = {ACTION: deque(maxlen=self.config.n_action_steps)}
         for key in self._observation_keys:
             self._queues[key] = deque(maxlen=self.config.n_obs_steps)
 
     def supports_rtc(self) -> bool:
-        """Whether real-time chunking works: with one observation, as the chunk then begins with the current step."""
+        """Whether real-time chunking works: only with one observation, because the chunk then begins at the current step."""
         return self.config.n_obs_steps == 1
 
     def init_rtc_processor(self) -> None:
-        """Takes over `rtc_config`; LeRobot calls this after it has set it."""
+        """Creates LeRobot's RTC processor from `rtc_config`. LeRobot calls this after it has set that option."""
         rtc_config = self.config.rtc_config
         is_on = rtc_config is not None and rtc_config.enabled
         self._rtc_processor = RTCProcessor(rtc_config) if is_on else None
 
     def forward(self, batch: dict[str, Any], reduction: str = "mean") -> tuple[Tensor, None]:
-        """The flow matching loss of a batch (Algorithm 1), with the moving average of the weights in eval mode.
+        """The flow matching loss of a batch (Algorithm 1). In evaluation mode it uses the moving average of the weights.
 
         Args:
             batch: ``{"observation.state": (B, [n_obs_steps,] state_dim), "observation.environment_state": (B,
@@ -150,20 +150,20 @@ class FMPPolicy(WithoutPEFT, WithModelCard, PreTrainedPolicy):
     ) -> Tensor:
         """The next `n_action_steps` actions, ``(B, n_action_steps, action_dim)`` [normalised].
 
-        With real-time chunking all ``horizon`` of them, the first of which go on from the last chunk.
+        With real-time chunking it returns all ``horizon`` actions, and the first of them continue the last chunk.
 
         Args:
-            batch: Normalised observations as for `forward`. A single frame stands for the whole window if
+            batch: Normalised observations as for `forward`. A single frame is repeated for the whole window if
                 `n_obs_steps` > 1.
             noise: ``(B, horizon, action_dim)`` prior sample x_0; drawn from N(0, I) if None.
             generator: Source of randomness for that draw.
-            guide: Bends every integration step; None leaves the flow as it is.
-            inference_delay: Real-time chunking: steps that are executed before this chunk is there.
+            guide: Changes every integration step; None leaves the flow unchanged.
+            inference_delay: Real-time chunking: steps that are executed before this chunk is available.
             prev_chunk_left_over: Real-time chunking: ``([B,] T_left, action_dim)`` the last chunk's actions that have not
-                been executed [normalised]; None begins afresh.
-            execution_horizon: Real-time chunking: steps up to which this chunk is drawn to those; None for the
-                configuration's.
-            **kwargs: Ignored, for callers that pass other policies' options.
+                been executed [normalised]; None if this chunk continues no other.
+            execution_horizon: Real-time chunking: number of steps over which this chunk is pulled towards those actions;
+                None for the value of the configuration.
+            **kwargs: Ignored, for callers that pass options of other policies.
 
         Raises:
             ValueError: If the noise has another shape, or there is a last chunk but real-time chunking is off.
@@ -213,7 +213,7 @@ class FMPPolicy(WithoutPEFT, WithModelCard, PreTrainedPolicy):
             **kwargs: Ignored, as in `predict_action_chunk`.
 
         Raises:
-            RuntimeError: If real-time chunking is on, which asks for chunks.
+            RuntimeError: If real-time chunking is on, because it needs whole chunks.
         """
         if self._rtc_processor is not None:
             raise RuntimeError("with real-time chunking use predict_action_chunk instead of select_action")
@@ -237,7 +237,7 @@ class FMPPolicy(WithoutPEFT, WithModelCard, PreTrainedPolicy):
         return [key for key, is_present in present.items() if is_present]
 
     def _observation_window(self, batch: dict[str, Any]) -> dict[str, Tensor]:
-        """The observations as ``(B, n_obs_steps, ...)``, cameras stacked into one tensor."""
+        """The observations as ``(B, n_obs_steps, ...)``. The images of all cameras are stacked into one tensor."""
         window = {}
         for key in self._observation_keys:
             value = batch.get(key)
@@ -263,7 +263,7 @@ class FMPPolicy(WithoutPEFT, WithModelCard, PreTrainedPolicy):
 def _start_missing_average_at_the_weights(
     policy: FMPPolicy, state_dict: dict[str, Tensor], prefix: str, *_: Any
 ) -> None:
-    """Fills in the average for weights saved without one, which would otherwise stay at its random start."""
+    """Sets the average to the weights if a checkpoint holds no average. Otherwise it would keep its random start."""
     average_prefix = f"{prefix}ema."
     if policy.ema is None or any(key.startswith(average_prefix) for key in state_dict):
         return

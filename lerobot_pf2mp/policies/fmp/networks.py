@@ -14,18 +14,18 @@ from torch import Tensor, nn
 if TYPE_CHECKING:
     from lerobot_pf2mp.policies.fmp.configuration_fmp import FMPConfig
 
-# LeRobot's sinusoidal embedding is made for diffusion steps 0..100; flow times 0..1 are stretched to the same range.
+# LeRobot's sinusoidal embedding is made for diffusion steps 0..100. Flow times 0..1 are scaled to the same range.
 _TIME_SCALE = 100.0
 
 
 class ObservationEncoder(nn.Module):
     """Turns a window of observations into one conditioning vector.
 
-    States pass unchanged, images through LeRobot's ResNet with spatial softmax; everything is concatenated over
+    States stay unchanged. Images are encoded by LeRobot's ResNet with spatial softmax. The results are concatenated over
     keys, cameras and time.
 
     Args:
-        config: The policy's configuration; its `input_features` say what there is to encode.
+        config: The policy's configuration. Its `input_features` are encoded.
     """
 
     def __init__(self, config: FMPConfig) -> None:
@@ -50,8 +50,8 @@ class ObservationEncoder(nn.Module):
 
         Args:
             batch: ``{"observation.state": (B, n_obs_steps, state_dim), "observation.environment_state":
-                (B, n_obs_steps, env_dim), "observation.images": (B, n_obs_steps, n_cameras, C, H, W)}``, as far as
-                the configuration has them; normalised.
+                (B, n_obs_steps, env_dim), "observation.images": (B, n_obs_steps, n_cameras, C, H, W)}``, normalised.
+                Only the keys of the configuration's features are needed.
         """
         features = []
         if self.has_state:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Real-time chunking (Black et al., 2025, arXiv:2506.07339): a new chunk goes on from the one that is being executed.
+"""Real-time chunking (Black et al., 2025, arXiv:2506.07339): a new chunk continues the one that is being executed.
 
-The method is LeRobot's, which counts time from 1 (noise) to 0 (data). Time is reversed here and nowhere else.
+The method is LeRobot's. LeRobot counts time from 1 (noise) to 0 (data). Only this file converts between the directions.
 """
 
 from __future__ import annotations
@@ -15,16 +15,18 @@ from lerobot_pf2mp.flow_matching import Steer
 def continuing(
     processor: RTCProcessor, left_over: Tensor, inference_delay: int, execution_horizon: int | None = None
 ) -> Steer:
-    """What steers the flow to chunks that begin with what is left of the last one.
+    """A function that steers the flow towards chunks that begin with the remaining actions of the last chunk.
 
     Args:
-        processor: LeRobot's, with its weights and schedule.
+        processor: LeRobot's RTC processor, with its weights and schedule.
         left_over: ``([B,] T_left, A)`` actions of the last chunk that have not been executed [normalised].
-        inference_delay: Steps that will be executed before the new chunk is there; these stay as they are.
-        execution_horizon: Steps up to which the new chunk is drawn to the old one; None for the processor's.
+        inference_delay: Steps that will be executed before the new chunk is available. Their actions stay unchanged.
+        execution_horizon: Number of steps over which the new chunk is pulled towards the old one; None for the value of
+            the processor.
 
     Returns:
-        Maps ``(B, T, A)`` points, ``(B,)`` times, 0 noise and 1 data and all the same, and velocities to velocities.
+        A function that maps ``(B, T, A)`` points, ``(B,)`` times and ``(B, T, A)`` velocities to the steered velocities. All
+        times must be equal; 0 is noise and 1 is data.
     """
 
     def steer(x_t: Tensor, t: Tensor, velocity: Tensor) -> Tensor:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every policy guided by a potential field has in common."""
+"""Code shared by all policies that are guided by a potential field."""

@@ -10,7 +10,7 @@ from lerobot_pf2mp.guidance import GuidanceSettings
 from lerobot_pf2mp.policies.guided.field_settings import FieldSettings
 from lerobot_pf2mp.policies.guided.support_monitor import ON_UNSUPPORTED
 
-# Policies read their settings for every plan. These are made and validated once, not for each plan.
+# Policies read their settings for every chunk. The caches create and validate equal settings only once.
 _field_settings = lru_cache(maxsize=64)(FieldSettings)
 _guidance_settings = lru_cache(maxsize=64)(GuidanceSettings)
 
@@ -22,16 +22,16 @@ class GuidedConfig:
     The field is a density over actions, so the actions it covers must be positions in the space that holds the
     obstacles (ball, gripper or joint positions). A density over displacements says nothing about obstacles.
 
-    All values can be changed at evaluation, for example with ``--policy.guidance_scale=0.4``; all but
-    `field_action_dims` then take effect without training.
+    All values can be changed at evaluation, for example with ``--policy.guidance_scale=0.4``. Only `field_action_dims` then
+    needs a new training.
 
     Args:
         guidance_scale: lambda, the strength of the guidance; 0 is exactly the unguided policy.
-        guidance_integrator: proximal (solved exactly over a step, flat in lambda) or euler (Algorithm 2 as printed).
+        guidance_integrator: proximal (solved exactly over a step, insensitive to lambda) or euler (Algorithm 2 as printed).
         guidance_point: The point at which each step evaluates the field: current (A_t), end (the end point that the step
             predicts) or next (after the step). None is the integrator's own: current for euler, end for proximal.
         on_unsupported: What happens when planned actions leave the demonstrated region: ignore, warn or hold, see
-            `SupportMonitor`. It needs the field, also where guidance_scale is 0.
+            `SupportMonitor`. warn and hold need the field, also with guidance_scale=0.
         n_field_points: Demonstrated actions M kept as anchors of the field.
         field_action_dims: Action dimensions the field covers; None covers all. A gripper's opening is usually left out.
         field_bandwidth: Kernel bandwidth h [normalised action units], or how to choose it: likelihood (leave-one-out

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demonstrated actions that a policy learns from, and the potential field fitted to them."""
+"""The demonstrated actions on which a policy is trained, and the potential field fitted to them."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ logger = logging.getLogger(__name__)
 
 
 class DemonstratedActions:
-    """An even sample of the frames a policy learns from, and the potential field fitted to their actions.
+    """A uniform sample of the frames on which a policy is trained, and the potential field fitted to their actions.
 
-    Frames are ranked by a hash of their index in the dataset and the first `n_points` in that order are kept. The
-    sample is therefore uniform over the distinct frames shown so far, however often and in which order they were
-    shown, and needs no random state.
+    Frames are ranked by a hash of their index in the dataset. The first `n_points` in that order are kept. So the sample
+    is uniform over the distinct frames seen so far. It does not depend on how often or in which order they were seen, and
+    it needs no random state.
 
     Args:
-        settings: What to keep and how to fit it.
+        settings: The settings of the sample and of the field.
     """
 
     def __init__(self, settings: FieldSettings) -> None:
@@ -49,15 +49,17 @@ class DemonstratedActions:
         settings: FieldSettings,
         dataset_id: bytes = b"",
     ) -> None:
-        """Takes in the actions of a training batch.
+        """Adds the actions of a training batch to the sample.
 
         Args:
             actions: ``(B, T, A)`` chunks [normalised].
             is_pad: ``(B, T)`` true where a chunk reaches beyond its episode; those actions are left out.
-            frames: ``(B,)`` index in the dataset of each chunk's first action; None counts every action as a frame of
-                its own.
-            settings: What to keep. Other action dimensions than before start the sample afresh.
-            dataset_id: Names the dataset and its normalisation. Another one than before starts the sample afresh.
+            frames: ``(B,)`` index in the dataset of each chunk's first action. With None, every action counts as a new
+                frame.
+            settings: The settings of the sample. If their action dimensions differ from those of before, a new sample
+                starts.
+            dataset_id: Identifies the dataset and its normalisation. If it differs from that of before, a new sample
+                starts.
 
         Raises:
             ValueError: If an action is not finite or a dimension does not exist.
@@ -81,17 +83,17 @@ class DemonstratedActions:
     def field(
         self, settings: FieldSettings | None = None, device: torch.device | str = "cpu"
     ) -> PotentialField:
-        """The potential field of the frames shown so far.
+        """The potential field of the frames seen so far.
 
         Args:
-            settings: What to fit with; None for the settings of training.
-            device: Where the field is needed; it stays there until it is asked for elsewhere.
+            settings: The settings of the field; None for those of training.
+            device: Device of the field. The field stays there until another device is requested.
 
         Returns:
-            The field, fitted when first asked for.
+            The field. It is fitted at the first call, and again after its frames or settings have changed.
 
         Raises:
-            ValueError: If nothing was shown yet, or the settings ask for other dimensions than were kept.
+            ValueError: If there are no frames yet, or the settings have other action dimensions than the sample.
         """
         settings = settings or self.settings
         if not len(self):
@@ -121,7 +123,7 @@ class DemonstratedActions:
         return self._fitted[1]
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The sample and the fitted field as CPU tensors; empty before anything was shown."""
+        """The sample and the fitted field as CPU tensors; empty if there are no frames yet."""
         if not len(self):
             return {}
         field = self.field()
@@ -138,7 +140,7 @@ class DemonstratedActions:
         """Restores the sample and the fitted field bit for bit.
 
         Args:
-            state: What `state_dict` returned.
+            state: The result of `state_dict`.
 
         Raises:
             ValueError: If an entry is missing or of the wrong kind, as in a corrupted file.
@@ -187,7 +189,7 @@ class DemonstratedActions:
             known = self._ranks.to(ranks.device)
             closest = known[torch.searchsorted(known, ranks).clamp_max(len(known) - 1)]
             if torch.equal(closest, ranks) and len(self) <= self.settings.n_points:
-                return  # nothing new: the fitted field stands
+                return  # no new frames: the fitted field stays valid
             ranks = torch.cat([ranks, known])
             points = torch.cat([points, self._points.to(points.device)])
         ranks, order = ranks.sort(stable=True)

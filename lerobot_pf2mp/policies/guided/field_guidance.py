@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The part of a guided policy that deals with the potential field.
+"""The part of a guided policy that uses the potential field.
 
-It shows the field what training saw, makes the guide from the field, and checks planned actions against it.
+It adds the actions of training batches to the field, makes the guide from the field, and checks planned actions with it.
 """
 
 from __future__ import annotations
@@ -32,10 +32,11 @@ if TYPE_CHECKING:
 class FieldGuidance:
     """Guidance by a potential field, held by one policy.
 
-    The field itself is in the batch, put there by the policy's preprocessor (see `potential_field_step`).
+    The field itself is in the batch. The policy's preprocessor puts it there (see `potential_field_step`).
 
     Args:
-        config: The policy's configuration. Its options may change between two calls.
+        config: The policy's configuration. Its options may change between two calls, except `on_unsupported` and
+            `field_action_dims`, which the monitor reads only here.
         dataset_stats: Statistics of the training dataset; None at evaluation.
     """
 
@@ -50,22 +51,22 @@ class FieldGuidance:
         self._made_from: tuple[PotentialField, GuidanceSettings] | None = None
 
     def reset(self) -> None:
-        """Forgets the last plan; to be called when an episode begins."""
+        """Forgets the last chunk. Must be called at the start of an episode."""
         self._monitor.reset()
 
     @property
     def support(self) -> Tensor | None:
-        """``(B, T)`` log density of the last plan's actions above the field's threshold [nats], negative outside.
+        """``(B, T)`` log density of the last chunk's actions above the field's threshold [nats], negative outside.
 
-        None before the first plan and with ``on_unsupported=ignore``.
+        None before the first chunk and with ``on_unsupported=ignore``.
         """
         return self._monitor.support
 
     def observe(self, batch: dict[str, Any]) -> None:
-        """Shows the actions of a training batch to the field in it; a batch without a field changes nothing.
+        """Adds the actions of a training batch to the field in that batch. A batch without a field changes nothing.
 
-        With several processes each field sees the batches of all of them, because only the main process saves its own.
-        They exchange B x T x (4 A + 1) bytes in every step, little beside the gradients.
+        With several processes, the field of each process gets the batches of all, because only the main process saves its
+        field. They exchange B x T x (4 A + 1) bytes in every step, which is little compared with the gradients.
 
         Args:
             batch: A training batch that the policy's own preprocessor has made.
@@ -89,7 +90,7 @@ class FieldGuidance:
     def guide(self, batch: dict[str, Any], device: torch.device) -> Guide | None:
         """The configured guide over the batch's field; None with a guidance scale of 0.
 
-        A guide is made once for a field and settings, and kept until one of them changes.
+        A guide is made once for a field and settings. It is kept until one of them changes.
 
         Args:
             batch: A batch that the policy's own preprocessor has made.
@@ -115,7 +116,7 @@ class FieldGuidance:
             chunk: ``(B, T, A)`` planned actions [normalised].
 
         Raises:
-            ValueError: If they are checked, and the batch holds no field, or one over other dimensions.
+            ValueError: If actions are checked, and the batch holds no field, or one over other dimensions.
         """
         return chunk if self.config.on_unsupported == "ignore" else self._monitored(batch, chunk)
 
@@ -127,10 +128,10 @@ class FieldGuidance:
 def fitted_field(
     demonstrations: object, config: GuidedPolicyConfig, device: torch.device | str = "cpu"
 ) -> PotentialField:
-    """The potential field by which a policy is guided.
+    """The potential field that guides a policy.
 
     Args:
-        demonstrations: What the policy's preprocessor puts into a batch under `POTENTIAL_FIELD`.
+        demonstrations: The object that the policy's preprocessor puts into a batch under `POTENTIAL_FIELD`.
         config: The policy's configuration.
         device: The device on which the field is used.
 
@@ -154,10 +155,10 @@ def fitted_field(
 
 
 def _identify_dataset(dataset_stats: dict[str, dict[str, Any]] | None, config: GuidedPolicyConfig) -> bytes:
-    """A digest of the action statistics and their normalisation, by which resuming and fine-tuning differ.
+    """A digest of the action statistics and their normalisation, which tells resuming from fine-tuning.
 
-    LeRobot reloads the saved preprocessor in both cases. With the same digest the sample goes on where it was; with
-    another one its points belong to other data, or to other units, and the sample starts afresh.
+    LeRobot reloads the saved preprocessor in both cases. With the same digest, the saved sample continues. With another
+    digest, its points belong to other data or have other units, so a new sample starts.
     """
     if not dataset_stats or ACTION not in dataset_stats:
         return b""

@@ -19,7 +19,7 @@ class FieldSettings:
     """The settings with which a field is fitted.
 
     Args:
-        n_points: Most demonstrated actions kept as anchors (M in the paper, which uses 3000).
+        n_points: Largest number of demonstrated actions that are kept as anchors (M in the paper, which uses 3000).
         action_dims: Action dimensions that the field covers; None covers all.
         bandwidth: A rule of `BANDWIDTH_RULES`, or the kernel bandwidth h itself [normalised].
         threshold_quantile: Quantile of the anchors' own log densities that bounds the safe set.

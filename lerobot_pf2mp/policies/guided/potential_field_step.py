@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The potential field as a preprocessing artifact: one step of the policy's preprocessor, saved beside the weights.
 
-The step hands one live object, its `DemonstratedActions`, to the policy in every batch. The policy writes to it in
-training and reads from it at inference; the step alone saves and loads it:
+The step gives one object, its `DemonstratedActions`, to the policy in every batch. The policy writes to it in training and
+reads from it at inference. Only the step saves and loads it:
 
                      preprocessor                                          policy
         batch ------> normaliser -> PotentialFieldProcessorStep --batch["potential_field"]--> FieldGuidance
@@ -11,11 +11,11 @@ training and reads from it at inference; the step alone saves and loads it:
                               DemonstratedActions <---- observe(actions) ---------+   training
                                          |        ----- field(settings) --------> |   inference
                        save_pretrained   |                                        v
-                       load              v                              guide of the flow, check of the plan
+                       load              v                              guide of the flow, check of the chunk
                 policy_preprocessor_step_<i>_potential_field.safetensors
 
-LeRobot saves, reloads and publishes preprocessors with every checkpoint, so the field needs no file, flag or command of
-its own. It sits behind the normaliser because the policy generates normalised actions.
+LeRobot saves, reloads and publishes preprocessors with every checkpoint, so the field needs no extra file format, option
+or command. The step comes after the normaliser, because the policy generates normalised actions.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ POTENTIAL_FIELD = "potential_field"
 
 @ProcessorStepRegistry.register("potential_field")
 class PotentialFieldProcessorStep(ProcessorStep):
-    """Hands the demonstrated actions and their potential field to the policy, and saves them with the preprocessor.
+    """Gives the demonstrated actions and their potential field to the policy, and saves them with the preprocessor.
 
     Args:
         settings: Fields of `FieldSettings`, as keyword arguments.
@@ -59,11 +59,11 @@ class PotentialFieldProcessorStep(ProcessorStep):
         return asdict(self.demonstrations.settings)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The demonstrations' state; fits the field if training has changed it."""
+        """The state of the demonstrations. Fits the field first if training has changed them."""
         return self.demonstrations.state_dict()
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Restores the demonstrations' state."""
+        """Restores the state of the demonstrations."""
         self.demonstrations.load_state_dict(state)
 
     def transform_features(

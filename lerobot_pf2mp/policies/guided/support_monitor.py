@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Watches whether planned actions stay where demonstrations went, for the robot's sake."""
+"""Checks whether planned actions stay in the demonstrated region, to protect the robot."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ logger = logging.getLogger(__name__)
 
 
 class SupportMonitor:
-    """Says how far each planned action leaves the demonstrated region, and may hold the robot where it was still inside.
+    """Measures how far planned actions leave the demonstrated region, and can hold the robot at the last action inside.
 
-    An action is supported if its density is at least the field's threshold: at 0 nats or above in `support`.
+    An action is supported if its density is at least the field's threshold. Its value in `support` is then at least 0.
 
     Args:
-        on_unsupported: ignore (do nothing, not even look), warn (log a line for each chunk that leaves the region) or hold
-            (warn, and repeat the last supported action instead of each one that is not).
+        on_unsupported: ignore (the policy does not call the monitor), warn (log a line for each chunk that leaves the
+            region) or hold (warn, and replace each unsupported action by the last supported one).
         action_dims: Action dimensions that the field covers; None covers all.
     """
 
@@ -32,7 +32,7 @@ class SupportMonitor:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets the last chunk; to be called when an episode begins."""
+        """Forgets the last chunk. Must be called at the start of an episode."""
         self.support: Tensor | None = None  # (B, T) log density above the threshold [nats] of the last chunk
         self._last_supported: Tensor | None = None  # (B, A)
 
@@ -44,9 +44,10 @@ class SupportMonitor:
             field: The potential field.
 
         Returns:
-            ``(B, T, A)``: the same, or with hold those of them that are supported, each repeated until the next one. Before
-            the first one it is the last of the chunk before, in a first chunk the first supported one; without any, the
-            chunk stays as it is.
+            ``(B, T, A)`` the same actions, except with hold. Then each unsupported action is replaced by the last supported
+            action before it. If the chunk has none before it, that is the last supported action of earlier chunks; in the
+            first chunk it is the first supported action of that chunk. A first chunk without supported actions stays
+            unchanged.
         """
         covered = chunk if self._dims is None else chunk[..., self._dims]
         self.support = field.log_density(covered) - field.log_threshold  # (B, T)

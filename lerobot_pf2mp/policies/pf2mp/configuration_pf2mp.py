@@ -12,7 +12,7 @@ from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
 @PreTrainedConfig.register_subclass("pf2mp")
 @dataclass
 class PF2MPConfig(GuidedConfig, FMPConfig):
-    """Configuration of PF2MP (Section IV-B of the paper): FMP and a potential field that guides its inference.
+    """Configuration of PF2MP (Section IV-B of the paper): FMP with a potential field that guides its inference.
 
     The arguments are those of `FMPConfig`, about network, flow and training, and of `GuidedConfig`, about guidance.
     """

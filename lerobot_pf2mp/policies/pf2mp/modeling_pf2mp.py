@@ -15,9 +15,10 @@ from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
 
 
 class PF2MPPolicy(FMPPolicy):
-    """Differs from `FMPPolicy` in three points: what training shows the field, the bent flow, and the checked plan.
+    """`FMPPolicy` with a potential field.
 
-    The weights are those of `FMPPolicy`, and with ``guidance_scale=0`` so are the actions. An observation passes
+    Training also adds its actions to the field, the guide changes every integration step, and each chunk is checked. The
+    weights are those of `FMPPolicy`, and with ``guidance_scale=0`` so are the actions. The calls for an observation are
 
         select_action -> predict_action_chunk (below: guide) -> FMPPolicy.predict_action_chunk
             -> integrate (each step: velocity, guide) -> VelocityNetwork
@@ -39,12 +40,12 @@ class PF2MPPolicy(FMPPolicy):
         dataset_meta: Any = None,
         **kwargs: Any,
     ) -> None:
-        # Before the set-up of FMPPolicy, which ends in `reset`.
+        # Before FMPPolicy.__init__, which calls `reset`.
         self.guidance = FieldGuidance(config, dataset_stats)
         super().__init__(config, dataset_stats, dataset_meta, **kwargs)
 
     def forward(self, batch: dict[str, Any], reduction: str = "mean") -> tuple[Tensor, None]:
-        """The loss of `FMPPolicy`; in training, the batch's actions also go to the potential field."""
+        """The loss of `FMPPolicy`. In training it also adds the batch's actions to the potential field."""
         if self.training and torch.is_grad_enabled():
             self.guidance.observe(batch)
         return super().forward(batch, reduction)
@@ -58,14 +59,14 @@ class PF2MPPolicy(FMPPolicy):
         guide: Guide | None = None,
         **options: Any,
     ) -> Tensor:
-        """The chunk of `FMPPolicy`, its flow bent by the guide in every integration step, and then checked.
+        """The chunk of `FMPPolicy` with a guide in every integration step. The chunk is then checked.
 
         Args:
             batch: As for `FMPPolicy.predict_action_chunk`, with the potential field.
             noise: As there.
             generator: As there.
-            guide: Bends every step instead of the configured guidance; None for that.
-            **options: Those of real-time chunking, as there.
+            guide: The guide to use instead of the configured one; None for the configured one.
+            **options: Options of real-time chunking, as there.
 
         Raises:
             ValueError: If there is guidance, or a check, and the batch holds no field or one over other dimensions.
@@ -75,7 +76,7 @@ class PF2MPPolicy(FMPPolicy):
         return self.guidance.check(batch, chunk)
 
     def reset(self) -> None:
-        """Forgets past observations and planned actions; to be called when an episode begins."""
+        """Forgets past observations and planned actions. Must be called at the start of an episode."""
         super().reset()
         self.guidance.reset()
 
