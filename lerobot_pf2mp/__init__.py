@@ -50,6 +50,8 @@ register()
 def __getattr__(name: str) -> Any:
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    # First, so that threads that need different names wait for one registration.
+    import_module("lerobot")
     return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
 
 

@@ -18,7 +18,9 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
+from importlib.util import find_spec
 from types import ModuleType
+from typing import Any
 
 
 def register() -> None:
@@ -82,22 +84,28 @@ class _Watch(MetaPathFinder):
     def __init__(self, package: str, call: Callable[[], None]) -> None:
         self._package = package
         self._call = call
+        self._is_searching = False
 
     def find_spec(
         self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        if name != self._package:
+        # While it searches, it must not find itself again, also not through the finder of another registration.
+        if name != self._package or self._is_searching:
             return None
-        for finder in sys.meta_path:
-            spec = None if finder is self else finder.find_spec(name, path, target)
-            if spec is not None and spec.loader is not None:
-                spec.loader = _LoaderThenCall(spec.loader, self._then)
-                return spec
-        return None
+        self._is_searching = True
+        try:
+            spec = find_spec(name)
+        finally:
+            self._is_searching = False
+        if spec is not None and spec.loader is not None:
+            spec.loader = _LoaderThenCall(spec.loader, self._then)
+        return spec
 
     def _then(self) -> None:
-        sys.meta_path.remove(self)
+        # Removed only if it succeeds, so that a second import of the package tries again.
         self._call()
+        if self in sys.meta_path:
+            sys.meta_path.remove(self)
 
 
 class _LoaderThenCall(Loader):
@@ -106,6 +114,9 @@ class _LoaderThenCall(Loader):
     def __init__(self, loader: Loader, call: Callable[[], None]) -> None:
         self._loader = loader
         self._call = call
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._loader, name)
 
     def create_module(self, spec: ModuleSpec) -> ModuleType | None:
         return self._loader.create_module(spec)
