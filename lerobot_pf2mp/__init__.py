@@ -44,8 +44,6 @@ _MODULES = {
     "load_policy": "loading",
 }
 
-register()
-
 
 def __getattr__(name: str) -> Any:
     if name not in _MODULES:
@@ -57,3 +55,6 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
+
+
+register()

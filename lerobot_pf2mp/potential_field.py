@@ -22,13 +22,12 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from lerobot_pf2mp.density.bandwidth import check_bandwidth, select_bandwidth
+from lerobot_pf2mp.density.bandwidth import DEFAULT_BANDWIDTH, check_bandwidth, select_bandwidth
 from lerobot_pf2mp.density.kernel_sums import KernelSums
 from lerobot_pf2mp.density.kernel_tree import KernelTree
 from lerobot_pf2mp.density.kernels import offsets_to_nearest
 
 # Defaults of `fit`, and of the policies' options.
-BANDWIDTH = "likelihood"
 THRESHOLD_QUANTILE = 0.01
 
 _TINY = torch.finfo(torch.float32).tiny
@@ -280,7 +279,7 @@ class PotentialField:
 def fit(
     points: Tensor,
     *,
-    bandwidth: float | str = BANDWIDTH,
+    bandwidth: float | str = DEFAULT_BANDWIDTH,
     threshold_quantile: float = THRESHOLD_QUANTILE,
     alpha: float = 0.0,
     n_anchors: int | None = None,

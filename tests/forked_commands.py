@@ -211,6 +211,7 @@ def _be_the_command(
         sys.exit(script.load()())
     except KeyboardInterrupt:
         traceback.print_exc()
+        atexit._run_exitfuncs()
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         os.kill(os.getpid(), signal.SIGINT)
     except Exception:

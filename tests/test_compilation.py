@@ -12,9 +12,9 @@ from torch import Tensor
 from lerobot_pf2mp import FMPConfig, PF2MPConfig
 from lerobot_pf2mp.density import kernel_tree
 from lerobot_pf2mp.density.kernel_sums import KernelSums
+from lerobot_pf2mp.policies.batch_keys import POTENTIAL_FIELD
 from lerobot_pf2mp.policies.fmp.modeling_fmp import FMPPolicy
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
-from lerobot_pf2mp.policies.guided.potential_field_step import POTENTIAL_FIELD
 from lerobot_pf2mp.policies.pf2mp.modeling_pf2mp import PF2MPPolicy
 from lerobot_pf2mp.potential_field import PotentialField, fit
 

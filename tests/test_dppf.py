@@ -22,9 +22,9 @@ from lerobot_pf2mp import DPPFConfig, PotentialFieldProcessorStep, load_policy
 from lerobot_pf2mp.dataset_tools.maze.collect_maze import collect_maze
 from lerobot_pf2mp.errors import ConfigError
 from lerobot_pf2mp.guidance import GUIDANCE_INTEGRATORS, GUIDANCE_POINTS, EulerGuide, ProximalGuide
+from lerobot_pf2mp.policies.batch_keys import POTENTIAL_FIELD
 from lerobot_pf2mp.policies.dppf.modeling_dppf import DPPFPolicy
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
-from lerobot_pf2mp.policies.guided.potential_field_step import POTENTIAL_FIELD
 
 STATE, ENV, ACTION = "observation.state", "observation.environment_state", "action"
 FRONT = "observation.images.front"

@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+import copy
 import math
 from collections.abc import Sequence
 
@@ -10,9 +11,9 @@ from lerobot_pf2mp import PF2MPConfig
 from lerobot_pf2mp.errors import ConfigError
 from lerobot_pf2mp.flow_matching import Guide, integrate
 from lerobot_pf2mp.guidance import GUIDANCE_INTEGRATORS, GUIDANCE_POINTS, GuidanceSettings, make_guide
+from lerobot_pf2mp.policies.batch_keys import POTENTIAL_FIELD
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
 from lerobot_pf2mp.policies.guided.field_guidance import FieldGuidance
-from lerobot_pf2mp.policies.guided.potential_field_step import POTENTIAL_FIELD
 from lerobot_pf2mp.policies.pf2mp.modeling_pf2mp import PF2MPPolicy
 from lerobot_pf2mp.potential_field import PotentialField, fit
 
@@ -315,6 +316,25 @@ def test_a_guide_is_made_once_and_kept_until_the_field_or_a_setting_changes():
         assert all(guide is not earlier for earlier in made), name
         assert guidance.guide({POTENTIAL_FIELD: shown}, cpu) is guide
         made.append(guide)
+
+
+def test_a_copy_of_a_guidance_makes_its_own_guide():
+    config = PF2MPConfig(
+        device="cpu",
+        horizon=8,
+        n_action_steps=4,
+        input_features={"observation.state": PolicyFeature(FeatureType.STATE, (3,))},
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (2,))},
+    )
+    guidance, cpu = FieldGuidance(config), torch.device("cpu")
+    shown = DemonstratedActions(config.field_settings)
+    shown.observe(torch.randn(40, 8, 2), None, None, settings=config.field_settings)
+    kept = guidance.guide({POTENTIAL_FIELD: shown}, cpu)
+    copied = copy.deepcopy(guidance)
+    assert not [value for value in vars(copied).values() if isinstance(value, tuple)]  # no field is copied
+    other = copied.guide({POTENTIAL_FIELD: shown}, cpu)
+    assert other is not kept and other.field is kept.field
+    assert guidance.guide({POTENTIAL_FIELD: shown}, cpu) is kept
 
 
 def test_settings_are_validated_once_for_all_plans():

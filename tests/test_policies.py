@@ -12,10 +12,10 @@ from torch import Tensor
 
 from lerobot_pf2mp import FMPConfig, PF2MPConfig, PotentialFieldProcessorStep
 from lerobot_pf2mp.errors import ConfigError
+from lerobot_pf2mp.policies.batch_keys import POTENTIAL_FIELD
 from lerobot_pf2mp.policies.fmp.fused_adamw import FusedAdamWConfig
 from lerobot_pf2mp.policies.fmp.modeling_fmp import FMPPolicy
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
-from lerobot_pf2mp.policies.guided.potential_field_step import POTENTIAL_FIELD
 from lerobot_pf2mp.policies.pf2mp.modeling_pf2mp import PF2MPPolicy
 
 STATE, ENV, ACTION = "observation.state", "observation.environment_state", "action"

@@ -8,9 +8,10 @@ from lerobot.processor import PolicyProcessorPipeline
 from lerobot.processor.converters import batch_to_transition, create_transition, transition_to_batch
 from torch import Tensor
 
+from lerobot_pf2mp.policies.batch_keys import POTENTIAL_FIELD
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions, _hash
 from lerobot_pf2mp.policies.guided.field_settings import FieldSettings
-from lerobot_pf2mp.policies.guided.potential_field_step import POTENTIAL_FIELD, PotentialFieldProcessorStep
+from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
 
 HORIZON = 8
 SETTINGS = FieldSettings(n_points=50, bandwidth="likelihood", threshold_quantile=0.1, alpha=-0.5)

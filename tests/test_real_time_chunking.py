@@ -13,10 +13,10 @@ from torch import Tensor
 
 from lerobot_pf2mp import DPPFConfig, PF2MPConfig
 from lerobot_pf2mp.flow_matching import integrate
+from lerobot_pf2mp.policies.batch_keys import POTENTIAL_FIELD
 from lerobot_pf2mp.policies.dppf.modeling_dppf import DPPFPolicy
 from lerobot_pf2mp.policies.fmp.real_time_chunking import continuing
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
-from lerobot_pf2mp.policies.guided.potential_field_step import POTENTIAL_FIELD
 from lerobot_pf2mp.policies.pf2mp.modeling_pf2mp import PF2MPPolicy
 
 HORIZON, ACTION_DIM, STATE = 16, 2, "observation.state"

@@ -53,10 +53,10 @@ for first in {FIRST!r}:
 """
 
 
-def run(code: str) -> str:
+def run(code: str, *options: str) -> str:
     """What a new process prints that runs this code, without the current folder in its path."""
     finished = subprocess.run(
-        [sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=120, check=False
+        [sys.executable, "-P", *options, "-c", code], capture_output=True, text=True, timeout=120, check=False
     )
     assert finished.returncode == 0, finished.stderr
     return finished.stdout
@@ -91,6 +91,55 @@ except AttributeError as error:
     assert run(code).strip() == "module 'lerobot_pf2mp' has no attribute 'load_polcy'"
 
 
+@pytest.mark.slow
+def test_a_package_that_is_registered_again_breaks_nothing() -> None:
+    code = """
+import importlib, sys, lerobot_pf2mp
+importlib.reload(lerobot_pf2mp)
+import lerobot, gymnasium
+importlib.reload(lerobot_pf2mp)
+from lerobot.configs import PreTrainedConfig
+assert {"fmp", "pf2mp", "dppf"} <= set(PreTrainedConfig.get_known_choices())
+assert "lerobot_pf2mp/MazeLarge-v0" in gymnasium.registry
+assert not [finder for finder in sys.meta_path if type(finder).__module__.startswith("lerobot_pf2mp")]
+print("done")
+"""
+    assert run(code, "-Werror::UserWarning:gymnasium").strip() == "done"
+
+
+@pytest.mark.slow
+def test_a_registration_that_fails_is_tried_again_and_never_silent() -> None:
+    code = """
+import sys, lerobot_pf2mp
+from lerobot_pf2mp._autodiscover import registration
+sys.modules["lerobot_pf2mp.policies.dppf.configuration_dppf"] = None  # importing it is an error
+for attempt in range(2):
+    try:
+        import lerobot
+    except ImportError as error:
+        print(type(error).__name__)
+del sys.modules["lerobot_pf2mp.policies.dppf.configuration_dppf"]
+import lerobot
+from lerobot.configs import PreTrainedConfig
+assert {"fmp", "pf2mp", "dppf"} <= set(PreTrainedConfig.get_known_choices())
+print("done")
+"""
+    assert run(code).split() == ["ModuleNotFoundError", "ModuleNotFoundError", "done"]
+
+
+@pytest.mark.slow
+def test_threads_that_use_different_names_first_wait_for_each_other() -> None:
+    code = """
+import lerobot_pf2mp
+from concurrent.futures import ThreadPoolExecutor
+with ThreadPoolExecutor(4) as pool:
+    names = ["load_policy", "PF2MPConfig", "PF2MPMazeEnv", "PotentialFieldProcessorStep"]
+    print(*[found.__name__ for found in pool.map(lambda name: getattr(lerobot_pf2mp, name), names)])
+"""
+    assert run(code).split() == ["load_policy", "PF2MPConfig", "PF2MPMazeEnv", "PotentialFieldProcessorStep"]
+
+
+@pytest.mark.slow
 def test_a_look_for_lerobot_leaves_it_as_it_is() -> None:
     code = """
 import importlib.util, sys, lerobot_pf2mp
@@ -137,3 +186,6 @@ script.load()()
     said = finished.stdout + finished.stderr
     assert message in said
     assert "Traceback" not in said
+    assert finished.returncode == (
+        0 if command.endswith("--version") else 2 if "unrecognized" in message else 1
+    )

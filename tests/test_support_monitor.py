@@ -10,9 +10,9 @@ from lerobot.configs import FeatureType, PolicyFeature
 from torch import Tensor
 
 from lerobot_pf2mp import DPPFConfig, PF2MPConfig
+from lerobot_pf2mp.policies.batch_keys import POTENTIAL_FIELD
 from lerobot_pf2mp.policies.dppf.modeling_dppf import DPPFPolicy
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
-from lerobot_pf2mp.policies.guided.potential_field_step import POTENTIAL_FIELD
 from lerobot_pf2mp.policies.guided.support_monitor import SupportMonitor
 from lerobot_pf2mp.policies.pf2mp.modeling_pf2mp import PF2MPPolicy
 from lerobot_pf2mp.potential_field import PotentialField, fit
@@ -141,6 +141,17 @@ def test_a_policy_holds_what_it_executes_and_reports_its_support(kind: str) -> N
     unsupported = supports["hold"] < 0
     assert unsupported.any(), "the case says nothing if the plan stays inside"
     assert not torch.equal(chunks["hold"], chunks["ignore"]) or unsupported.all()
+
+
+def test_an_option_that_is_changed_later_takes_effect() -> None:
+    noise = torch.randn(1, HORIZON, 2, generator=torch.Generator().manual_seed(1))
+    held = policy_of("pf2mp", on_unsupported="hold")
+    changed = policy_of("pf2mp", on_unsupported="ignore")
+    before = changed.predict_action_chunk(batch_for(changed), noise=noise)
+    changed.config.on_unsupported = "hold"
+    after = changed.predict_action_chunk(batch_for(changed), noise=noise)
+    assert torch.equal(after, held.predict_action_chunk(batch_for(held), noise=noise))
+    assert not torch.equal(after, before)
 
 
 def test_a_policy_forgets_at_reset() -> None:

@@ -22,6 +22,9 @@ from importlib.util import find_spec
 from types import ModuleType
 from typing import Any
 
+# Also the namespace of the environments in Gymnasium.
+PACKAGE = "lerobot_pf2mp"
+
 
 def register() -> None:
     """Registers policies, processor step, optimiser and environments: now, or when LeRobot and Gymnasium are imported."""
@@ -42,32 +45,29 @@ def register_with_lerobot() -> None:
 
 
 def register_gym_environments() -> None:
-    """Registers the environments with Gymnasium. MuJoCo is imported only when an environment is created."""
+    """Registers the environments with Gymnasium, unless they are registered; MuJoCo is imported when one is made."""
     import gymnasium
 
     from lerobot_pf2mp.envs import tasks
 
-    for task, maze in tasks.MAZE_TASKS.items():
-        gymnasium.register(
-            id=f"lerobot_pf2mp/{task}",
-            entry_point="lerobot_pf2mp.envs.maze.maze_env:MazeEnv",
-            max_episode_steps=tasks.MAZE_STEPS,
-            kwargs={"maze_map": maze},
-        )
-    for task, name in tasks.FETCH_TASKS.items():
-        gymnasium.register(
-            id=f"lerobot_pf2mp/{task}",
-            entry_point="lerobot_pf2mp.envs.fetch.fetch_env:FetchEnv",
-            max_episode_steps=tasks.FETCH_STEPS,
-            kwargs={"task": name},
-        )
-    for task, space in tasks.HANDWRITING_TASKS.items():
-        gymnasium.register(
-            id=f"lerobot_pf2mp/{task}",
-            entry_point="lerobot_pf2mp.envs.handwriting.handwriting_env:HandwritingEnv",
-            max_episode_steps=tasks.HANDWRITING_STEPS,
-            kwargs={"space": space},
-        )
+    entry_points = {
+        "maze.maze_env:MazeEnv": ("maze_map", tasks.MAZE_TASKS, tasks.MAZE_STEPS),
+        "fetch.fetch_env:FetchEnv": ("task", tasks.FETCH_TASKS, tasks.FETCH_STEPS),
+        "handwriting.handwriting_env:HandwritingEnv": (
+            "space",
+            tasks.HANDWRITING_TASKS,
+            tasks.HANDWRITING_STEPS,
+        ),
+    }
+    for entry_point, (argument, names, max_episode_steps) in entry_points.items():
+        for name, value in names.items():
+            if f"{PACKAGE}/{name}" not in gymnasium.registry:
+                gymnasium.register(
+                    id=f"{PACKAGE}/{name}",
+                    entry_point=f"{PACKAGE}.envs.{entry_point}",
+                    max_episode_steps=max_episode_steps,
+                    kwargs={argument: value},
+                )
 
 
 def _once_imported(package: str, call: Callable[[], None]) -> None:
@@ -104,8 +104,8 @@ class _Watch(MetaPathFinder):
     def _then(self) -> None:
         # Removed only if it succeeds, so that a second import of the package tries again.
         self._call()
-        if self in sys.meta_path:
-            sys.meta_path.remove(self)
+        # A new list: another thread may be looking through the old one.
+        sys.meta_path = [finder for finder in sys.meta_path if finder is not self]
 
 
 class _LoaderThenCall(Loader):

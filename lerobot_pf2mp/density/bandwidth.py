@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from numbers import Real
 
 import torch
 from torch import Tensor
@@ -11,6 +12,7 @@ from torch import Tensor
 from lerobot_pf2mp.density.kernels import PAIRS_PER_BLOCK, log_kernels, log_sum_exp, mean
 
 BANDWIDTH_RULES = ("scott", "silverman", "likelihood")
+DEFAULT_BANDWIDTH = "likelihood"
 
 # Smallest bandwidth, relative to the spread of the points. Float32 cannot resolve narrower kernels.
 _SMALLEST_BANDWIDTH = 1e-3
@@ -40,13 +42,13 @@ def check_bandwidth_rule(rule: float | str, name: str = "bandwidth") -> None:
     Raises:
         ValueError: If it is neither.
     """
-    if isinstance(rule, (int, float)) and not isinstance(rule, bool):
-        check_bandwidth(rule, name)
+    if isinstance(rule, Real) and not isinstance(rule, bool):
+        check_bandwidth(float(rule), name)
     elif rule not in BANDWIDTH_RULES:
         raise ValueError(f"{name} must be one of {BANDWIDTH_RULES} or a positive number, got {rule!r}")
 
 
-def select_bandwidth(points: Tensor, rule: float | str = "likelihood") -> float:
+def select_bandwidth(points: Tensor, rule: float | str = DEFAULT_BANDWIDTH) -> float:
     """The kernel bandwidth h for a set of points.
 
     Args:

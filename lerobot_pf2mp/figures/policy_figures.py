@@ -29,8 +29,8 @@ from lerobot_pf2mp.envs.tasks import MAZE_TASKS
 from lerobot_pf2mp.figures import Path2D, PathPair, Scene
 from lerobot_pf2mp.figures.comparison_video import write_comparison
 from lerobot_pf2mp.loading import load_policy
+from lerobot_pf2mp.policies.batch_keys import POTENTIAL_FIELD
 from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
-from lerobot_pf2mp.policies.guided.potential_field_step import POTENTIAL_FIELD
 from lerobot_pf2mp.results.rows import SummaryRow, read_rows
 from lerobot_pf2mp.results.summary import group_cells
 

@@ -52,7 +52,7 @@ class GuidanceFacts:
         scale: lambda.
         integrator: proximal or euler.
         point: The point at which the field is evaluated; None for the integrator's own.
-        action_dims: The action dimensions that the field covers; None for all.
+        action_dims: The action dimensions that the field covers.
         alpha: Weight of the distance term [1/normalised].
         bandwidth_rule: The rule by which the bandwidth was chosen; None for a given number.
         bandwidth: The bandwidth h [normalised action units]; None if the field is not fitted.
@@ -62,7 +62,7 @@ class GuidanceFacts:
     scale: float
     integrator: str
     point: str | None
-    action_dims: Sequence[int] | None
+    action_dims: Sequence[int]
     alpha: float
     bandwidth_rule: str | None
     bandwidth: float | None = None
@@ -257,12 +257,11 @@ def _describe_guidance(guidance: GuidanceFacts) -> list[tuple[str, str]]:
     if guidance.bandwidth is None:
         return rows
     rule = f", by the rule {guidance.bandwidth_rule}" if guidance.bandwidth_rule else ""
-    dims = guidance.action_dims
     return [
         *rows,
         ("bandwidth h", f"{guidance.bandwidth:.4g} [normalised action units]{rule}"),
         ("anchors M", f"{guidance.n_anchors} demonstrated actions"),
-        ("action dimensions of the field", "all" if dims is None else ", ".join(map(str, dims))),
+        ("action dimensions of the field", ", ".join(map(str, guidance.action_dims))),
         ("distance term alpha", f"{guidance.alpha:g}"),
     ]
 

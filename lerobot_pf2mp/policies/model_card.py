@@ -80,18 +80,20 @@ def policy_facts(
         horizon=config.horizon,
         n_action_steps=config.n_action_steps,
         num_inference_steps=config.num_inference_steps or config.num_train_timesteps,
-        guidance=_guidance_facts(config, field) if isinstance(config, GuidedConfig) else None,
+        guidance=_guidance_facts(config, field, outputs["action"][0])
+        if isinstance(config, GuidedConfig)
+        else None,
         license=license or config.license,
         tags=tuple(tags or config.tags or ()),
     )
 
 
-def _guidance_facts(config: GuidedConfig, field: PotentialField | None) -> GuidanceFacts:
+def _guidance_facts(config: GuidedConfig, field: PotentialField | None, action_dim: int) -> GuidanceFacts:
     return GuidanceFacts(
         scale=config.guidance_scale,
         integrator=config.guidance_integrator,
         point=config.guidance_point,
-        action_dims=config.field_action_dims,
+        action_dims=range(action_dim) if config.field_action_dims is None else config.field_action_dims,
         alpha=config.field_alpha,
         bandwidth_rule=config.field_bandwidth if isinstance(config.field_bandwidth, str) else None,
         bandwidth=None if field is None else field.bandwidth,

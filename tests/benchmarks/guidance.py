@@ -17,8 +17,8 @@ import torch
 from harness import Row, ratio, threads, time_in_turns
 from maze_policies import HORIZON, NAMES, PAPER, SMALL, Planner, make_planner, replay
 
+from lerobot_pf2mp.policies.batch_keys import POTENTIAL_FIELD
 from lerobot_pf2mp.policies.guided.field_guidance import fitted_field
-from lerobot_pf2mp.policies.guided.potential_field_step import POTENTIAL_FIELD
 from lerobot_pf2mp.potential_field import PotentialField
 
 BATCH_SIZES = (1, 64)

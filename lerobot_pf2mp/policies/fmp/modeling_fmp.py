@@ -15,14 +15,13 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
 from lerobot_pf2mp.flow_matching import Guide, flow_matching_loss, integrate, sample_time
+from lerobot_pf2mp.policies.batch_keys import ACTION_IS_PAD
 from lerobot_pf2mp.policies.fmp.configuration_fmp import FMPConfig
 from lerobot_pf2mp.policies.fmp.ema import MovingAverage
 from lerobot_pf2mp.policies.fmp.networks import VelocityNetwork
 from lerobot_pf2mp.policies.fmp.real_time_chunking import continuing
 from lerobot_pf2mp.policies.model_card import WithModelCard
 from lerobot_pf2mp.policies.without_peft import WithoutPEFT
-
-ACTION_IS_PAD = f"{ACTION}_is_pad"
 
 
 class FMPPolicy(WithoutPEFT, WithModelCard, PreTrainedPolicy):

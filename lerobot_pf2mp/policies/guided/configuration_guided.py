@@ -75,7 +75,15 @@ class GuidedConfig:
     def _validate_guidance(self) -> None:
         if self.on_unsupported not in ON_UNSUPPORTED:
             raise ValueError(f"on_unsupported must be one of {ON_UNSUPPORTED}, got {self.on_unsupported!r}")
-        _ = self.guidance_settings, self.field_settings  # they validate their own values
+        # They validate their own values. Not from the caches, which take hashable values only.
+        GuidanceSettings(self.guidance_scale, self.guidance_integrator, self.guidance_point)
+        FieldSettings(
+            self.n_field_points,
+            self._field_dims,
+            self.field_bandwidth,
+            self.field_threshold_quantile,
+            self.field_alpha,
+        )
 
     def _validate_field_dims(self, action_feature: PolicyFeature) -> None:
         action_dim = action_feature.shape[0]

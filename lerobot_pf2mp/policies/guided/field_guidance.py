@@ -16,8 +16,8 @@ from torch import Tensor
 
 from lerobot_pf2mp.flow_matching import Guide
 from lerobot_pf2mp.guidance import GuidanceSettings, make_guide
+from lerobot_pf2mp.policies.batch_keys import ACTION_IS_PAD, POTENTIAL_FIELD
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
-from lerobot_pf2mp.policies.guided.potential_field_step import POTENTIAL_FIELD
 from lerobot_pf2mp.policies.guided.support_monitor import SupportMonitor
 from lerobot_pf2mp.potential_field import PotentialField
 from lerobot_pf2mp.training.gathering import gather_rows
@@ -35,8 +35,7 @@ class FieldGuidance:
     The field itself is in the batch. The policy's preprocessor puts it there (see `potential_field_step`).
 
     Args:
-        config: The policy's configuration. Its options may change between two calls, except `on_unsupported` and
-            `field_action_dims`, which the monitor reads only here.
+        config: The policy's configuration. Its options may change between two calls.
         dataset_stats: Statistics of the training dataset; None at evaluation.
     """
 
@@ -47,8 +46,11 @@ class FieldGuidance:
         self._dataset_id = _identify_dataset(dataset_stats, config)
         self.demonstrations: DemonstratedActions | None = None  # those of the last training batch
         self._monitor = SupportMonitor(config.on_unsupported, config.field_action_dims)
-        self._guide: Guide | None = None
-        self._made_from: tuple[PotentialField, GuidanceSettings] | None = None
+        self._made: tuple[PotentialField, GuidanceSettings, Guide | None] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The state for copies and pickles of the policy. A copy makes its own guide."""
+        return {**vars(self), "_made": None}
 
     def reset(self) -> None:
         """Forgets the last chunk. Must be called at the start of an episode."""
@@ -75,13 +77,11 @@ class FieldGuidance:
         if demonstrations is None:
             return
         self.demonstrations = demonstrations
-        actions, is_pad, frames = gather_rows(
-            batch[ACTION], batch.get(f"{ACTION}_is_pad"), batch.get("index")
-        )
+        actions, is_pad, frames = gather_rows(batch[ACTION], batch.get(ACTION_IS_PAD), batch.get("index"))
         demonstrations.observe(
             cast(Tensor, actions),
             is_pad,
-            None if frames is None else frames + (1 - self.config.n_obs_steps),
+            None if frames is None else frames + self.config.action_delta_indices[0],
             settings=self.config.field_settings,
             dataset_id=self._dataset_id,
         )
@@ -102,11 +102,10 @@ class FieldGuidance:
         settings = self.config.guidance_settings
         if settings.scale == 0:
             return None
-        made_from = fitted_field(batch.get(POTENTIAL_FIELD), self.config, device), settings
-        if made_from != self._made_from:
-            field, _ = made_from
-            self._guide, self._made_from = make_guide(field.prepared, settings), made_from
-        return self._guide
+        field, made = fitted_field(batch.get(POTENTIAL_FIELD), self.config, device), self._made
+        if made is None or made[0] is not field or made[1] != settings:
+            made = self._made = field, settings, make_guide(field.prepared, settings)
+        return made[2]
 
     def check(self, batch: dict[str, Any], chunk: Tensor) -> Tensor:
         """The actions ``(B, T, A)`` to execute of a planned chunk, see ``on_unsupported`` in `GuidedConfig`.
@@ -122,6 +121,8 @@ class FieldGuidance:
 
     @torch.compiler.disable  # the field may have to be fitted first
     def _monitored(self, batch: dict[str, Any], chunk: Tensor) -> Tensor:
+        self._monitor.on_unsupported = self.config.on_unsupported
+        self._monitor.action_dims = self.config.field_action_dims
         return self._monitor(chunk, fitted_field(batch.get(POTENTIAL_FIELD), self.config, chunk.device))
 
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from lerobot_pf2mp.density.bandwidth import check_bandwidth_rule
+from lerobot_pf2mp.density.bandwidth import DEFAULT_BANDWIDTH, check_bandwidth_rule
 from lerobot_pf2mp.potential_field import (
-    BANDWIDTH,
     THRESHOLD_QUANTILE,
     check_alpha,
     check_threshold_quantile,
@@ -31,7 +30,7 @@ class FieldSettings:
 
     n_points: int = 3000
     action_dims: tuple[int, ...] | None = None
-    bandwidth: float | str = BANDWIDTH
+    bandwidth: float | str = DEFAULT_BANDWIDTH
     threshold_quantile: float = THRESHOLD_QUANTILE
     alpha: float = -0.1
 

@@ -28,11 +28,9 @@ from lerobot.lerobot_types import EnvTransition, TransitionKey
 from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 from torch import Tensor
 
+from lerobot_pf2mp.policies.batch_keys import POTENTIAL_FIELD
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
 from lerobot_pf2mp.policies.guided.field_settings import FieldSettings
-
-# The key of a batch under which the policy finds the `DemonstratedActions`.
-POTENTIAL_FIELD = "potential_field"
 
 
 @ProcessorStepRegistry.register("potential_field")

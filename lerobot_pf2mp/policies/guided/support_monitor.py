@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -22,13 +23,13 @@ class SupportMonitor:
 
     Args:
         on_unsupported: ignore (the policy does not call the monitor), warn (log a line for each chunk that leaves the
-            region) or hold (warn, and replace each unsupported action by the last supported one).
-        action_dims: Action dimensions that the field covers; None covers all.
+            region) or hold (warn, and replace each unsupported action by the last supported one). It can be changed.
+        action_dims: Action dimensions that the field covers; None covers all. They can be changed.
     """
 
-    def __init__(self, on_unsupported: str, action_dims: tuple[int, ...] | None = None) -> None:
-        self._on_unsupported = on_unsupported
-        self._dims = None if action_dims is None else list(action_dims)
+    def __init__(self, on_unsupported: str, action_dims: Sequence[int] | None = None) -> None:
+        self.on_unsupported = on_unsupported
+        self.action_dims = action_dims
         self.reset()
 
     def reset(self) -> None:
@@ -49,7 +50,7 @@ class SupportMonitor:
             first chunk it is the first supported action of that chunk. A first chunk without supported actions stays
             unchanged.
         """
-        covered = chunk if self._dims is None else chunk[..., self._dims]
+        covered = chunk if self.action_dims is None else chunk[..., list(self.action_dims)]
         self.support = field.log_density(covered) - field.log_threshold  # (B, T)
         is_supported = self.support >= 0
         if not is_supported.all():
@@ -59,7 +60,7 @@ class SupportMonitor:
                 is_supported.numel(),
                 -self.support.min().item(),
             )
-        return self._hold(chunk, is_supported) if self._on_unsupported == "hold" else chunk
+        return self._hold(chunk, is_supported) if self.on_unsupported == "hold" else chunk
 
     def _hold(self, chunk: Tensor, is_supported: Tensor) -> Tensor:
         steps = torch.arange(chunk.shape[1], device=chunk.device).expand_as(is_supported)
