@@ -99,7 +99,7 @@ def test_unknown_options_end_with_the_usage_and_nothing_written(tmp_path: Path) 
             [
                 *MAZES,
                 "by default local/TASK",
-                "of which 1 is the largest (100 N)",
+                "relative to the largest force (100 N)",
                 "by default 80 for a maze, 48 for Fetch",
                 "by default 4000 for a maze, 1000 for Fetch",
                 "handwriting_joint or handwriting_pen.",
@@ -403,7 +403,7 @@ def test_help_of_benchmark_shows_examples_and_defaults(
         "Examples: pf2mp-benchmark --policies='{pf2mp: ",
         "none, or INTEGRATOR:LAMBDA,LAMBDA,... (default: ['none', 'proximal:0.8'])",
         "(default: 500)",
-        "{seed} and {task} in a path are replaced",
+        "{seed} and {task} in the path of a checkpoint are replaced",
     ):
         assert fact in words
 
