@@ -2,6 +2,7 @@
 import copy
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import pytest
 import torch
@@ -20,6 +21,19 @@ from lerobot_pf2mp.potential_field import PotentialField, fit
 
 def random_field(dim: int = 2, alpha: float = 0.0, bandwidth: float = 0.2) -> PotentialField:
     return fit(torch.randn(200, dim), bandwidth=bandwidth, threshold_quantile=0.2, alpha=alpha)
+
+
+def config_of(**options: Any) -> PF2MPConfig:
+    return PF2MPConfig(
+        device="cpu",
+        horizon=8,
+        n_action_steps=4,
+        down_dims=(8, 16),
+        diffusion_step_embed_dim=16,
+        input_features={"observation.state": PolicyFeature(FeatureType.STATE, (3,))},
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (2,))},
+        **options,
+    )
 
 
 def guide_of(
@@ -262,17 +276,7 @@ def test_an_unknown_guidance_point_in_a_configuration_is_an_error_that_names_the
 @pytest.mark.parametrize(("integrator", "default"), [("euler", "current"), ("proximal", "end")])
 @pytest.mark.parametrize("point", [None, *GUIDANCE_POINTS])
 def test_the_guidance_point_of_the_configuration_is_that_of_the_policys_guide(integrator, default, point):
-    config = PF2MPConfig(
-        device="cpu",
-        horizon=8,
-        n_action_steps=4,
-        down_dims=(8, 16),
-        diffusion_step_embed_dim=16,
-        input_features={"observation.state": PolicyFeature(FeatureType.STATE, (3,))},
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (2,))},
-        guidance_integrator=integrator,
-        guidance_point=point,
-    )
+    config = config_of(guidance_integrator=integrator, guidance_point=point)
     shown = DemonstratedActions(config.field_settings)
     shown.observe(torch.randn(40, 8, 2), None, None, settings=config.field_settings)
     guide = PF2MPPolicy(config).guidance.guide({POTENTIAL_FIELD: shown}, torch.device("cpu"))
@@ -280,15 +284,7 @@ def test_the_guidance_point_of_the_configuration_is_that_of_the_policys_guide(in
 
 
 def test_a_guide_is_made_once_and_kept_until_the_field_or_a_setting_changes():
-    config = PF2MPConfig(
-        device="cpu",
-        horizon=8,
-        n_action_steps=4,
-        down_dims=(8, 16),
-        diffusion_step_embed_dim=16,
-        input_features={"observation.state": PolicyFeature(FeatureType.STATE, (3,))},
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (2,))},
-    )
+    config = config_of()
     guidance, cpu = FieldGuidance(config), torch.device("cpu")
     shown, other = DemonstratedActions(config.field_settings), DemonstratedActions(config.field_settings)
     for demonstrations in (shown, other):
@@ -319,13 +315,7 @@ def test_a_guide_is_made_once_and_kept_until_the_field_or_a_setting_changes():
 
 
 def test_a_copy_of_a_guidance_makes_its_own_guide():
-    config = PF2MPConfig(
-        device="cpu",
-        horizon=8,
-        n_action_steps=4,
-        input_features={"observation.state": PolicyFeature(FeatureType.STATE, (3,))},
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (2,))},
-    )
+    config = config_of()
     guidance, cpu = FieldGuidance(config), torch.device("cpu")
     shown = DemonstratedActions(config.field_settings)
     shown.observe(torch.randn(40, 8, 2), None, None, settings=config.field_settings)
@@ -338,13 +328,7 @@ def test_a_copy_of_a_guidance_makes_its_own_guide():
 
 
 def test_settings_are_validated_once_for_all_plans():
-    config = PF2MPConfig(
-        device="cpu",
-        horizon=8,
-        n_action_steps=4,
-        input_features={"observation.state": PolicyFeature(FeatureType.STATE, (3,))},
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (2,))},
-    )
+    config = config_of()
     assert config.guidance_settings is config.guidance_settings
     assert config.field_settings is config.field_settings
     config.guidance_scale = -1.0
