@@ -410,7 +410,7 @@ def test_a_collected_dataset_holds_what_the_expert_wrote(
     ("space", "meaning"),
     [
         ("joint", "positions of the seven joints [rad] and the two fingers [m]"),
-        ("pen", "place x, y of the pen's tip [m]"),
+        ("pen", "position x, y of the pen's tip [m]"),
     ],
 )
 def test_the_card_says_what_is_written_by_whom_and_in_which_units(

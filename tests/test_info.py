@@ -410,7 +410,7 @@ def test_help_of_info_shows_examples_units_and_defaults() -> None:
     words = " ".join(result.stdout.split())
     for fact in (
         "Examples: pf2mp-info",
-        "may take [s]. (default: 120.0)",
+        "Largest duration of each trial [s]. (default: 120.0)",
         "for issue reports",
         "Ends with code 0",
     ):
