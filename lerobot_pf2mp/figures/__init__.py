@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures; the only user of matplotlib. `policy_figures.py` collects their contents.
+"""Draws figures. This is the only package that uses matplotlib; `policy_figures.py` collects what is drawn.
 
 Importing this package does not import matplotlib; drawing does.
 """
