@@ -89,6 +89,7 @@ class _Watch(MetaPathFinder):
     def find_spec(
         self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
+        """The package's own spec, with a loader that also calls the function; None for every other module."""
         # While it searches, it must not find itself again, also not through the finder of another registration.
         if name != self._package or self._is_searching:
             return None
@@ -119,9 +120,11 @@ class _LoaderThenCall(Loader):
         return getattr(self._loader, name)
 
     def create_module(self, spec: ModuleSpec) -> ModuleType | None:
+        """The module that the own loader creates."""
         return self._loader.create_module(spec)
 
     def exec_module(self, module: ModuleType) -> None:
+        """Executes the module with its own loader, and then calls the function."""
         assert module.__spec__ is not None  # the import system has set it
         module.__spec__.loader = module.__loader__ = self._loader
         self._loader.exec_module(module)
