@@ -412,6 +412,6 @@ def test_help_of_info_shows_examples_units_and_defaults() -> None:
         "Examples: pf2mp-info",
         "Largest duration of each trial [s]. (default: 120.0)",
         "for issue reports",
-        "Ends with code 0",
+        "The exit code is 0",
     ):
         assert fact in words
