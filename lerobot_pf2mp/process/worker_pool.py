@@ -29,6 +29,8 @@ def worker_pool(
         initargs=(initializer, arguments),
     )
     try:
+        with _sigint_blocked():
+            pool.submit(_begin)  # the first task starts all processes
         yield pool
     except KeyboardInterrupt:
         # A terminal has interrupted them too, but `kill` reaches this process alone, and a task may take minutes.
@@ -39,7 +41,22 @@ def worker_pool(
         pool.shutdown(cancel_futures=True)
 
 
+@contextmanager
+def _sigint_blocked() -> Iterator[None]:
+    """Blocks SIGINT here and in new processes. One that is interrupted while it imports would print a traceback."""
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+
+
 def _start(initializer: Callable[..., None], arguments: tuple[Any, ...]) -> None:
     # Ctrl-C in a terminal reaches every process; Python's own handler would print a traceback in each.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     initializer(*arguments)
+
+
+def _begin() -> None:
+    """The task with which the processes start."""
