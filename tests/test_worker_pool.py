@@ -76,3 +76,28 @@ if __name__ == "__main__":
     command = [sys.executable, tmp_path / "program.py"]
     result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert (result.stdout, result.stderr) == ("BrokenProcessPool\n", "")
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_interrupted_while_it_imports_says_nothing(tmp_path: Path) -> None:
+    (tmp_path / "program.py").write_text(
+        """
+import os, signal, time
+from pathlib import Path
+from lerobot_pf2mp.process.worker_pool import worker_pool
+
+def nothing(): pass
+
+if __name__ == "__mp_main__":  # the import of a worker, before it begins
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(0.5)
+    Path("imported").touch()
+if __name__ == "__main__":
+    with worker_pool(1, nothing, ()) as pool:
+        print(type(pool.submit(nothing).exception()).__name__)
+"""
+    )
+    command = [sys.executable, tmp_path / "program.py"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, cwd=tmp_path)
+    assert (result.stdout, result.stderr) == ("BrokenProcessPool\n", "")
+    assert (tmp_path / "imported").exists()
