@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 from lerobot_pf2mp.errors import explained
 from lerobot_pf2mp.loading import load_config
+from lerobot_pf2mp.policies.guided.action_units import normalised_unit
 from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
 from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
 from lerobot_pf2mp.process.atomic_files import written_beside
@@ -152,15 +153,24 @@ def _fitted_step(
         raise ValueError(f"the dataset's action must have the policy's shape {tuple(wanted)}, got {shape}")
     settings = cast(GuidedConfig, config).field_settings
     step = PotentialFieldProcessorStep(**asdict(settings))
-    frames = dataset.hf_dataset.with_format("numpy", columns=[ACTION, "index"])
+    unit = torch.ones(shape)
+    for normaliser in preprocessor.steps:
+        if isinstance(normaliser, NormalizerProcessorStep):
+            unit = normalised_unit(normaliser, *shape)
+    frames = dataset.hf_dataset.with_format("numpy", columns=[ACTION, "index", "episode_index"])
     starts = range(0, len(frames), _FRAMES_AT_ONCE)
     for start in tqdm(starts, desc="Reading actions", unit="block", disable=len(starts) < 2):
         block = frames[start : start + _FRAMES_AT_ONCE]
         actions = torch.from_numpy(np.array(block[ACTION], dtype=np.float32)).reshape(-1, 1, *shape)
+        actions = _normalise(actions, preprocessor)
+        episodes = torch.from_numpy(block["episode_index"])
         # Without a dataset_id, training that continues from this checkpoint fits a new field, to its own data.
         step.demonstrations.observe(
-            _normalise(actions, preprocessor), None, torch.from_numpy(block["index"]), settings=settings
+            actions, None, torch.from_numpy(block["index"]), episodes, settings=settings
         )
+        is_start = torch.ones(1, len(episodes), dtype=torch.bool)
+        is_start[0, 1:] = episodes.diff() != 0
+        step.demonstrations.recognise_angles(actions.reshape(1, -1, *shape), is_start, unit)
     step.demonstrations.field()  # raises an error now if the dataset has no actions, not later at inference
     return step
 

@@ -9,8 +9,9 @@ from lerobot.processor.converters import batch_to_transition, create_transition,
 from torch import Tensor
 
 from lerobot_pf2mp.policies.batch_keys import POTENTIAL_FIELD
-from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions, _hash
+from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
 from lerobot_pf2mp.policies.guided.field_settings import FieldSettings
+from lerobot_pf2mp.policies.guided.frame_ranks import rank_of
 from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
 
 HORIZON = 8
@@ -353,7 +354,7 @@ def test_settings_that_break_their_rule_are_an_error(settings, message):
 @pytest.mark.parametrize("start", [0, -1000, 2**40, -(2**63)])
 def test_the_hash_is_one_to_one_on_a_million_consecutive_numbers(start):
     numbers = torch.arange(1_000_000) + start
-    assert len(torch.unique(_hash(numbers))) == 1_000_000
+    assert len(torch.unique(rank_of(numbers))) == 1_000_000
 
 
 def test_the_hash_is_the_finaliser_of_splitmix64():
@@ -365,7 +366,7 @@ def test_the_hash_is_the_finaliser_of_splitmix64():
         return x ^ (x >> 31)
 
     numbers = [0, 1, 2, 12345, 2**40, 2**63 - 1]
-    assert [value % 2**64 for value in _hash(torch.tensor(numbers)).tolist()] == [
+    assert [value % 2**64 for value in rank_of(torch.tensor(numbers)).tolist()] == [
         splitmix64(x) for x in numbers
     ]
 

@@ -4,7 +4,8 @@
 Anchors lie in the leaves of a k-d tree. Queries are sorted into groups of neighbours. Each group walks down the tree
 once, nearer child first, and skips each node that is too far away to count for any of its queries. A query keeps its
 sums relative to the kernel of the nearest anchor seen so far, as attention does, so that they neither overflow nor
-vanish. Distances come from differences, not from |q|^2 - 2 q.x + |x|^2, so that single precision is enough.
+vanish. Distances come from differences, not from |q|^2 - 2 q.x + |x|^2, so that single precision is enough. In an angle
+they are the short way round: its positions and queries are kept within half a period of the centre.
 */
 
 #define _GNU_SOURCE /* RTLD_DEFAULT */
@@ -34,6 +35,7 @@ enum {
 typedef float Lanes __attribute__((vector_size(4 * LANES)));
 typedef float LooseLanes __attribute__((vector_size(4 * LANES), aligned(4)));
 typedef int32_t Integers __attribute__((vector_size(4 * LANES)));
+typedef int32_t LooseIntegers __attribute__((vector_size(4 * LANES), aligned(4)));
 
 #define INLINE static inline __attribute__((always_inline))
 
@@ -50,10 +52,15 @@ typedef int32_t Integers __attribute__((vector_size(4 * LANES)));
    least -LARGEST. */
 static const float FARTHEST = 5e17f, LARGEST = 3e38f;
 
+/* An offset beyond this leads to a slot without an anchor. */
+static const float NO_ANCHOR = 5e18f;
+
 typedef struct {
     const float *leaves; /* (L, D, WIDTH); leaf i is node L - 1 + i */
     const float *boxes;  /* (2 L - 1, 2, D) corners; node k has the children 2 k + 1 and 2 k + 2 */
     const float *centre; /* (D,) origin of leaves and boxes */
+    const float *periods; /* (D,) of angles, 0 for other dimensions; NULL if there are no angles */
+    const int32_t *labels; /* (L, WIDTH) of the anchors; NULL if there are none */
     Py_ssize_t n_leaves, dim;
     float exponent_per_square; /* log2(e) / 2h^2: times a squared distance, it is a kernel's negative exponent of 2 */
     float exponent_range;      /* kernels smaller than the nearest anchor's by more powers of two are left out */
@@ -68,10 +75,12 @@ typedef struct {
     Lanes *sums;       /* (G, 1 + D) of kernels, and of kernels times offsets, each relative to the nearest anchor's */
     double *totals;    /* (G, 1 + D) of what left `sums` */
     int *n_leaves;     /* (G,) that `sums` holds */
+    int32_t *labels;   /* (G,) only for the aim OTHERS */
 } Group;
 
-/* The wanted result: the sums, or only the nearest anchor. */
-typedef enum { SUMS, NEAREST } Aim;
+/* The wanted result: the sums; only the nearest anchor; or the sum of the kernels, without offsets, and the nearest
+   distance, both over the anchors whose label differs from the query's by more than 1. */
+typedef enum { SUMS, NEAREST, OTHERS } Aim;
 
 /* ---- Sorting points into groups of neighbours -------------------------------------------------------------------- */
 
@@ -186,17 +195,50 @@ INLINE void move_to_totals(Group *group, Py_ssize_t i, Py_ssize_t dim) {
     group->n_leaves[i] = 0;
 }
 
-INLINE void distances(const float *leaf, const float *q, const Py_ssize_t dim, Lanes squares[VECTORS]) {
+/* Offsets of at most one period, the short way round. */
+INLINE Lanes short_way(Lanes offset, float period) {
+    const Lanes turns = offset * (1.0f / period) + 12582912.0f; /* 1.5 * 2^23: the last digit is worth 1 */
+    const Lanes around = offset - period * (turns - 12582912.0f);
+    const Integers is_slot = offset > NO_ANCHOR;
+    return (Lanes)((is_slot & (Integers)offset) | (~is_slot & (Integers)around));
+}
+
+INLINE float short_way_of_one(float offset, float period) {
+    const float turns = offset * (1.0f / period) + 12582912.0f;
+    return offset - period * (turns - 12582912.0f);
+}
+
+INLINE Lanes offsets_from(
+    const Tree *tree, const float *leaf, const float *q, Py_ssize_t d, int v, const int wraps
+) {
+    const Lanes offset = load(leaf + d * WIDTH + v * LANES) - q[d];
+    return wraps && tree->periods[d] > 0.0f ? short_way(offset, tree->periods[d]) : offset;
+}
+
+INLINE void distances(
+    const Tree *tree, const float *leaf, const float *q, const Py_ssize_t dim, Lanes squares[VECTORS], const int wraps
+) {
     for (int v = 0; v < VECTORS; v++) squares[v] = (Lanes){0};
     for (Py_ssize_t d = 0; d < dim; d++)
         for (int v = 0; v < VECTORS; v++) {
-            const Lanes offset = load(leaf + d * WIDTH + v * LANES) - q[d];
+            const Lanes offset = offsets_from(tree, leaf, q, d, v, wraps);
             squares[v] += offset * offset;
         }
 }
 
+/* Puts the anchors of a leaf whose label differs from the query's by at most 1 infinitely far away. */
+INLINE void leave_out(const int32_t *labels, int32_t label, Lanes squares[VECTORS]) {
+    const Lanes zero = {0}, infinite = zero + INFINITY;
+    for (int v = 0; v < VECTORS; v++) {
+        const Integers difference = *(const LooseIntegers *)(labels + v * LANES) - label;
+        const Integers is_left_out = (difference >= -1) & (difference <= 1);
+        squares[v] = (Lanes)((is_left_out & (Integers)infinite) | (~is_left_out & (Integers)squares[v]));
+    }
+}
+
 INLINE void add_kernels(
-    const Tree *tree, const float *leaf, Group *group, Py_ssize_t i, const Lanes squares[VECTORS], const Py_ssize_t dim
+    const Tree *tree, const float *leaf, Group *group, Py_ssize_t i, const Lanes squares[VECTORS], const Py_ssize_t dim,
+    const Aim aim, const int wraps
 ) {
     const float *q = group->positions + i * dim;
     Lanes *sums = group->sums + i * (1 + dim);
@@ -205,9 +247,9 @@ INLINE void add_kernels(
         weights[v] = power_of_two(tree->exponent_per_square * (group->nearest[i] - squares[v]));
         sums[0] += weights[v];
     }
-    for (Py_ssize_t d = 0; d < dim; d++) {
+    for (Py_ssize_t d = 0; aim == SUMS && d < dim; d++) {
         Lanes shift = sums[1 + d];
-        for (int v = 0; v < VECTORS; v++) shift += weights[v] * (load(leaf + d * WIDTH + v * LANES) - q[d]);
+        for (int v = 0; v < VECTORS; v++) shift += weights[v] * offsets_from(tree, leaf, q, d, v, wraps);
         sums[1 + d] = shift;
     }
     if (++group->n_leaves[i] == LEAVES_IN_SINGLE) move_to_totals(group, i, dim);
@@ -222,50 +264,64 @@ INLINE void shrink(Group *group, Py_ssize_t i, float factor, const Py_ssize_t di
 
 /* Stores the offset to the anchor of this leaf that is nearest to query i. */
 INLINE void store_offset(
-    const float *leaf, Group *group, Py_ssize_t i, const Lanes squares[VECTORS], const Py_ssize_t dim
+    const Tree *tree, const float *leaf, Group *group, Py_ssize_t i, const Lanes squares[VECTORS], const Py_ssize_t dim,
+    const int wraps
 ) {
     float flat[WIDTH];
     memcpy(flat, squares, sizeof flat);
     int slot = 0;
     while (slot < WIDTH - 1 && flat[slot] != group->nearest[i]) slot++;
-    for (Py_ssize_t d = 0; d < dim; d++)
-        group->offsets[i * dim + d] = leaf[d * WIDTH + slot] - group->positions[i * dim + d];
+    for (Py_ssize_t d = 0; d < dim; d++) {
+        const float offset = leaf[d * WIDTH + slot] - group->positions[i * dim + d];
+        const int is_angle = wraps && tree->periods[d] > 0.0f;
+        group->offsets[i * dim + d] = is_angle ? short_way_of_one(offset, tree->periods[d]) : offset;
+    }
 }
 
 INLINE void visit_leaf(
-    const Tree *tree, const float *leaf, Group *group, Py_ssize_t i, const Py_ssize_t dim, const Aim aim
+    const Tree *tree, const float *leaf, Py_ssize_t number, Group *group, Py_ssize_t i, const Py_ssize_t dim,
+    const Aim aim, const int wraps
 ) {
     Lanes squares[VECTORS];
-    distances(leaf, group->positions + i * dim, dim, squares);
+    distances(tree, leaf, group->positions + i * dim, dim, squares, wraps);
+    if (aim == OTHERS) leave_out(tree->labels + number * WIDTH, group->labels[i], squares);
     Lanes least = squares[0];
     for (int v = 1; v < VECTORS; v++) least = lower(least, squares[v]);
     const float nearest = lowest(least), before = group->nearest[i];
+    if (aim == OTHERS && nearest == INFINITY) return;
     if (nearest < before) {
         group->nearest[i] = nearest;
         if (aim == NEAREST)
-            store_offset(leaf, group, i, squares, dim);
+            store_offset(tree, leaf, group, i, squares, dim, wraps);
         else
             shrink(group, i, exp2f(tree->exponent_per_square * (nearest - before)), dim);
     }
     const int counts = !(tree->exponent_per_square * (nearest - before) > tree->exponent_range);
-    if (aim == SUMS && counts) add_kernels(tree, leaf, group, i, squares, dim);
+    if (aim != NEAREST && counts) add_kernels(tree, leaf, group, i, squares, dim, aim, wraps);
 }
 
 /* ---- Walking down the tree --------------------------------------------------------------------------------------- */
 
-/* The squared distance between two boxes. */
-INLINE float gap(const float *low, const float *high, const float *box, const Py_ssize_t dim) {
+/* The squared distance between two boxes; in an angle, to the nearest of a box's images. */
+INLINE float gap(
+    const Tree *tree, const float *low, const float *high, const float *box, const Py_ssize_t dim, const int wraps
+) {
     float square = 0.0f;
     for (Py_ssize_t d = 0; d < dim; d++) {
         const float below = box[d] - high[d], above = low[d] - box[dim + d];
-        const float distance = below > above ? below : above;
+        float distance = below > above ? below : above;
+        if (wraps && tree->periods[d] > 0.0f) {
+            /* Both lie within half a period of the centre. A box below has an image above, and the other way round. */
+            const float around = tree->periods[d] + (below < above ? below : above);
+            distance = around < distance ? around : distance;
+        }
         square += distance > 0.0f ? distance * distance : 0.0f;
     }
     return square;
 }
 
-INLINE void walk(const Tree *tree, Group *group, const Py_ssize_t dim, const Aim aim) {
-    const float exponent_range = aim == SUMS ? tree->exponent_range : 0.0f;
+INLINE void walk(const Tree *tree, Group *group, const Py_ssize_t dim, const Aim aim, const int wraps) {
+    const float exponent_range = aim != NEAREST ? tree->exponent_range : 0.0f;
     struct {
         Py_ssize_t node;
         float square;
@@ -276,8 +332,8 @@ INLINE void walk(const Tree *tree, Group *group, const Py_ssize_t dim, const Aim
         if (tree->exponent_per_square * (todo[n_todo].square - farthest) > exponent_range) continue;
         if (node < tree->n_leaves - 1) {
             Py_ssize_t near = 2 * node + 1, far = near + 1;
-            float near_square = gap(group->low, group->high, tree->boxes + near * 2 * dim, dim);
-            float far_square = gap(group->low, group->high, tree->boxes + far * 2 * dim, dim);
+            float near_square = gap(tree, group->low, group->high, tree->boxes + near * 2 * dim, dim, wraps);
+            float far_square = gap(tree, group->low, group->high, tree->boxes + far * 2 * dim, dim, wraps);
             if (far_square < near_square) {
                 const float square = near_square;
                 near_square = far_square, far_square = square;
@@ -287,39 +343,58 @@ INLINE void walk(const Tree *tree, Group *group, const Py_ssize_t dim, const Aim
             todo[n_todo].node = near, todo[n_todo++].square = near_square;
             continue;
         }
-        const float *leaf = tree->leaves + (node - (tree->n_leaves - 1)) * dim * WIDTH;
+        const Py_ssize_t number = node - (tree->n_leaves - 1);
+        const float *leaf = tree->leaves + number * dim * WIDTH;
         const float *box = tree->boxes + node * 2 * dim;
         farthest = 0.0f;
         for (Py_ssize_t i = 0; i < group->size; i++) {
             const float *q = group->positions + i * dim;
-            if (!(tree->exponent_per_square * (gap(q, q, box, dim) - group->nearest[i]) > exponent_range))
-                visit_leaf(tree, leaf, group, i, dim, aim);
+            const float square = gap(tree, q, q, box, dim, wraps);
+            if (!(tree->exponent_per_square * (square - group->nearest[i]) > exponent_range))
+                visit_leaf(tree, leaf, number, group, i, dim, aim, wraps);
             farthest = group->nearest[i] > farthest ? group->nearest[i] : farthest;
         }
     }
 }
 
 FOR_EACH_PROCESSOR static void sum_up(const Tree *tree, Group *group) {
-    switch (tree->dim) { /* loops of a known length are unrolled */
-    case 1: walk(tree, group, 1, SUMS); break;
-    case 2: walk(tree, group, 2, SUMS); break;
-    case 3: walk(tree, group, 3, SUMS); break;
-    case 4: walk(tree, group, 4, SUMS); break;
-    default: walk(tree, group, tree->dim, SUMS);
+    switch (tree->periods ? 0 : tree->dim) { /* loops of a known length are unrolled */
+    case 0: walk(tree, group, tree->dim, SUMS, 1); break;
+    case 1: walk(tree, group, 1, SUMS, 0); break;
+    case 2: walk(tree, group, 2, SUMS, 0); break;
+    case 3: walk(tree, group, 3, SUMS, 0); break;
+    case 4: walk(tree, group, 4, SUMS, 0); break;
+    default: walk(tree, group, tree->dim, SUMS, 0);
     }
 }
 
-FOR_EACH_PROCESSOR static void find_nearest(const Tree *tree, Group *group) { walk(tree, group, tree->dim, NEAREST); }
+FOR_EACH_PROCESSOR static void find_nearest(const Tree *tree, Group *group) {
+    if (tree->periods)
+        walk(tree, group, tree->dim, NEAREST, 1);
+    else
+        walk(tree, group, tree->dim, NEAREST, 0);
+}
+
+FOR_EACH_PROCESSOR static void sum_others(const Tree *tree, Group *group) {
+    switch (tree->periods ? 0 : tree->dim) {
+    case 0: walk(tree, group, tree->dim, OTHERS, 1); break;
+    case 2: walk(tree, group, 2, OTHERS, 0); break;
+    default: walk(tree, group, tree->dim, OTHERS, 0);
+    }
+}
 
 /* ---- Groups of queries ------------------------------------------------------------------------------------------- */
 
-static void gather(Group *group, const Tree *tree, const float *queries, const int64_t *order, Py_ssize_t size) {
+static void gather(
+    Group *group, const Tree *tree, const float *queries, const int32_t *labels, const int64_t *order, Py_ssize_t size
+) {
     const Py_ssize_t dim = tree->dim;
     group->size = size;
     for (Py_ssize_t d = 0; d < dim; d++) group->low[d] = INFINITY, group->high[d] = -INFINITY;
     for (Py_ssize_t i = 0; i < size; i++) {
         for (Py_ssize_t d = 0; d < dim; d++) {
-            const float x = queries[order[i] * dim + d] - tree->centre[d];
+            float x = queries[order[i] * dim + d] - tree->centre[d];
+            if (tree->periods && tree->periods[d] > 0.0f) x = remainderf(x, tree->periods[d]);
             const float clamped = x < -FARTHEST ? -FARTHEST : x > FARTHEST ? FARTHEST : x;
             group->positions[i * dim + d] = clamped;
             group->low[d] = clamped < group->low[d] ? clamped : group->low[d];
@@ -327,6 +402,7 @@ static void gather(Group *group, const Tree *tree, const float *queries, const i
         }
         group->nearest[i] = INFINITY;
         group->n_leaves[i] = 0;
+        if (labels) group->labels[i] = labels[order[i]];
     }
     memset(group->offsets, 0, size * dim * sizeof *group->offsets);
     memset(group->sums, 0, size * (1 + dim) * sizeof *group->sums);
@@ -345,19 +421,31 @@ static void scatter_sums(Group *group, const Tree *tree, const int64_t *order, f
     }
 }
 
+static void scatter_others(Group *group, const Tree *tree, const int64_t *order, float *log_sums, float *squares) {
+    for (Py_ssize_t i = 0; i < group->size; i++) {
+        move_to_totals(group, i, tree->dim);
+        const double total = group->totals[i * (1 + tree->dim)];
+        const double exponent = M_LN2 * tree->exponent_per_square * (double)group->nearest[i];
+        log_sums[order[i]] = total > 0.0 ? (float)(log(total) - exponent) : -INFINITY;
+        squares[order[i]] = group->nearest[i];
+    }
+}
+
 static void scatter_offsets(const Group *group, Py_ssize_t dim, const int64_t *order, float *offsets) {
     for (Py_ssize_t i = 0; i < group->size; i++)
         memcpy(offsets + order[i] * dim, group->offsets + i * dim, dim * sizeof *offsets);
 }
 
 /* A computation for n of the queries. `order` holds their indices and is reordered. The result is log sums, and unless
-   `offsets` is NULL the offsets to the local means. If `log_sums` is NULL, it is the offsets to the nearest anchor. */
+   `offsets` is NULL the offsets to the local means. If `log_sums` is NULL, it is the offsets to the nearest anchor. With
+   `labels` it is the log sums and the squared nearest distances over the anchors with other labels. */
 typedef struct {
     const Tree *tree;
     const float *queries;
+    const int32_t *labels;
     int64_t *order;
     Py_ssize_t n;
-    float *offsets, *log_sums;
+    float *offsets, *log_sums, *squares;
     Py_ssize_t n_slices, next_slice; /* each thread takes the next slice when it has finished one */
     int has_memory;
 } Job;
@@ -369,17 +457,22 @@ static int do_slice(const Job *job, int64_t *order, Py_ssize_t n) {
     double *totals = malloc(row * sizeof *totals);
     float *floats = malloc((2 * GROUP * dim + 2 * dim + GROUP) * sizeof *floats);
     int n_in_sums[GROUP];
+    int32_t labels[GROUP];
     const int has_memory = sums && totals && floats;
     if (has_memory) {
-        Group group = {.sums = sums, .totals = totals, .n_leaves = n_in_sums, .positions = floats};
+        Group group = {.sums = sums, .totals = totals, .n_leaves = n_in_sums, .labels = labels};
+        group.positions = floats;
         group.offsets = group.positions + GROUP * dim;
         group.low = group.offsets + GROUP * dim;
         group.high = group.low + dim;
         group.nearest = group.high + dim;
         sort(job->queries, dim, order, n, GROUP);
         for (Py_ssize_t i = 0; i < n; i += GROUP) {
-            gather(&group, tree, job->queries, order + i, n - i < GROUP ? n - i : GROUP);
-            if (job->log_sums) {
+            gather(&group, tree, job->queries, job->labels, order + i, n - i < GROUP ? n - i : GROUP);
+            if (job->labels) {
+                sum_others(tree, &group);
+                scatter_others(&group, tree, order + i, job->log_sums, job->squares);
+            } else if (job->log_sums) {
                 sum_up(tree, &group);
                 scatter_sums(&group, tree, order + i, job->offsets, job->log_sums);
             } else {
@@ -512,18 +605,20 @@ static int step_all_to_targets(
 
 /* ---- For Python -------------------------------------------------------------------------------------------------- */
 
-/* A tree as Python holds it: (leaves, boxes, centre, exponent_per_square, exponent_range). */
+/* A tree as Python holds it: (leaves, boxes, centre, periods, exponent_per_square, exponent_range). `periods` is empty
+   if there are no angles. */
 typedef struct {
-    Py_buffer leaves, boxes, centre;
+    Py_buffer leaves, boxes, centre, periods;
     float exponent_per_square, exponent_range;
 } HeldTree;
 
-#define HELD_TREE "(y*y*y*ff)"
+#define HELD_TREE "(y*y*y*y*ff)"
 #define POINTERS_TO(held) \
-    &(held).leaves, &(held).boxes, &(held).centre, &(held).exponent_per_square, &(held).exponent_range
+    &(held).leaves, &(held).boxes, &(held).centre, &(held).periods, &(held).exponent_per_square, &(held).exponent_range
 
 static void release(HeldTree *held) {
-    PyBuffer_Release(&held->leaves), PyBuffer_Release(&held->boxes), PyBuffer_Release(&held->centre);
+    PyBuffer_Release(&held->leaves), PyBuffer_Release(&held->boxes);
+    PyBuffer_Release(&held->centre), PyBuffer_Release(&held->periods);
 }
 
 static Py_ssize_t n_floats(const Py_buffer *buffer) { return buffer->len / sizeof(float); }
@@ -533,11 +628,13 @@ static int read_tree(const HeldTree *held, Tree *tree) {
     const Py_ssize_t dim = n_floats(&held->centre), n_nodes = dim ? n_floats(&held->boxes) / (2 * dim) : 0;
     *tree = (Tree){
         .leaves = held->leaves.buf, .boxes = held->boxes.buf, .centre = held->centre.buf,
+        .periods = held->periods.len ? held->periods.buf : NULL,
         .n_leaves = (n_nodes + 1) / 2, .dim = dim,
         .exponent_per_square = held->exponent_per_square, .exponent_range = held->exponent_range,
     };
     return n_nodes % 2 && n_floats(&held->boxes) == n_nodes * 2 * dim
-        && n_floats(&held->leaves) == tree->n_leaves * dim * WIDTH;
+        && n_floats(&held->leaves) == tree->n_leaves * dim * WIDTH
+        && (!held->periods.len || n_floats(&held->periods) == dim);
 }
 
 static PyObject *answer(int fits, int has_memory) {
@@ -583,6 +680,33 @@ static PyObject *sum_kernels(PyObject *module, PyObject *args) {
         Py_END_ALLOW_THREADS;
     }
     release(&held), PyBuffer_Release(&queries), PyBuffer_Release(&offsets), PyBuffer_Release(&log_sums);
+    return answer(fits, has_memory);
+}
+
+static PyObject *sum_other_kernels(PyObject *module, PyObject *args) {
+    HeldTree held;
+    Py_buffer labels, queries, query_labels, log_sums, squares;
+    int n_threads, has_memory = 1;
+    Tree tree;
+    if (!PyArg_ParseTuple(
+            args, HELD_TREE "y*y*y*w*w*i", POINTERS_TO(held), &labels, &queries, &query_labels, &log_sums, &squares,
+            &n_threads
+        ))
+        return NULL;
+    const Py_ssize_t n = n_floats(&log_sums);
+    const int fits = read_tree(&held, &tree) && n_floats(&queries) == n * tree.dim && squares.len == log_sums.len
+        && n_floats(&query_labels) == n && n_floats(&labels) == tree.n_leaves * WIDTH;
+    if (fits) {
+        Py_BEGIN_ALLOW_THREADS;
+        tree.labels = labels.buf;
+        Job job = {.tree = &tree, .queries = queries.buf, .labels = query_labels.buf, .order = indices(n), .n = n};
+        job.log_sums = log_sums.buf, job.squares = squares.buf;
+        has_memory = job.order && do_job(&job, n_threads);
+        free(job.order);
+        Py_END_ALLOW_THREADS;
+    }
+    release(&held), PyBuffer_Release(&labels), PyBuffer_Release(&queries), PyBuffer_Release(&query_labels);
+    PyBuffer_Release(&log_sums), PyBuffer_Release(&squares);
     return answer(fits, has_memory);
 }
 
@@ -654,6 +778,7 @@ static PyObject *step_to_targets(PyObject *module, PyObject *args) {
 static PyMethodDef methods[] = {
     {"order_points", order_points, METH_VARARGS, "Sorts points into leaves."},
     {"sum_kernels", sum_kernels, METH_VARARGS, "The offsets to local means, and the logarithms of the sums."},
+    {"sum_other_kernels", sum_other_kernels, METH_VARARGS, "Log sums and nearest distances over other labels."},
     {"lead_to_targets", lead_to_targets, METH_VARARGS, "The offsets to the nearest target where the log sum is low."},
     {"step_to_targets", step_to_targets, METH_VARARGS, "The steps to local means and, at a low log sum, to targets."},
     {NULL, NULL, 0, NULL},

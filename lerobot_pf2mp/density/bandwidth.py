@@ -4,11 +4,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 from numbers import Real
 
 import torch
 from torch import Tensor
 
+from lerobot_pf2mp.density.held_out import HeldOut
 from lerobot_pf2mp.density.kernels import PAIRS_PER_BLOCK, log_kernels, log_sum_exp, mean
 
 BANDWIDTH_RULES = ("scott", "silverman", "likelihood")
@@ -17,9 +20,22 @@ DEFAULT_BANDWIDTH = "likelihood"
 # Smallest bandwidth, relative to the spread of the points. Float32 cannot resolve narrower kernels.
 _SMALLEST_BANDWIDTH = 1e-3
 
+# Bandwidths whose squares and logarithms are ordinary float32 numbers.
+_BANDWIDTH_RANGE = (1e-12, 1e12)
+
+# Largest number of points that decide on the bandwidth.
+_N_JUDGED = 3000
+
+# Share of the points, the least likely ones, that do not count when episodes judge each other. It bounds the influence
+# of wrong values and of an episode that went where no other did.
+_LEFT_OUT_SHARE = 0.05
+
+# Of one episode's points that are this many bandwidths apart or less, one counts.
+_REST = 0.25
+
 
 def check_bandwidth(bandwidth: float, name: str = "bandwidth") -> None:
-    """Checks that a bandwidth is finite and positive.
+    """Checks that a bandwidth is finite and positive, and not so extreme that its square is neither.
 
     Args:
         bandwidth: The bandwidth h.
@@ -30,6 +46,9 @@ def check_bandwidth(bandwidth: float, name: str = "bandwidth") -> None:
     """
     if not (bandwidth > 0 and math.isfinite(bandwidth)):
         raise ValueError(f"{name} must be finite and positive, got {bandwidth}")
+    smallest, largest = _BANDWIDTH_RANGE
+    if not smallest <= bandwidth <= largest:
+        raise ValueError(f"{name} must lie between {smallest:g} and {largest:g}, got {bandwidth}")
 
 
 def check_bandwidth_rule(rule: float | str, name: str = "bandwidth") -> None:
@@ -48,14 +67,24 @@ def check_bandwidth_rule(rule: float | str, name: str = "bandwidth") -> None:
         raise ValueError(f"{name} must be one of {BANDWIDTH_RULES} or a positive number, got {rule!r}")
 
 
-def select_bandwidth(points: Tensor, rule: float | str = DEFAULT_BANDWIDTH) -> float:
+def select_bandwidth(
+    points: Tensor,
+    rule: float | str = DEFAULT_BANDWIDTH,
+    *,
+    groups: Tensor | None = None,
+    periods: Tensor | None = None,
+) -> float:
     """The kernel bandwidth h for a set of points.
 
     Args:
         points: ``(M, D)`` points [normalised].
         rule: ``scott`` (M^(-1/(D+4)) times the points' standard deviation), ``silverman`` (the same times
-            (4/(D+2))^(1/(D+4))), ``likelihood`` (maximises the leave-one-out log likelihood), or h itself. The kernel
-            is isotropic, so the standard deviation is the root mean square over the dimensions that vary.
+            (4/(D+2))^(1/(D+4))), ``likelihood`` (maximises the likelihood of the points, each judged by the others), or
+            h itself. The kernel is isotropic, so the standard deviation is the root mean square over the dimensions that
+            vary.
+        groups: ``(M,)`` int64, see `group_numbers`. With them ``likelihood`` judges each point by other groups, not by
+            all other points, see `_most_likely_across_groups`.
+        periods: ``(D,)`` periods of angles [normalised], 0 for other dimensions; used with `groups`.
 
     Returns:
         The bandwidth h > 0 [normalised].
@@ -77,6 +106,11 @@ def select_bandwidth(points: Tensor, rule: float | str = DEFAULT_BANDWIDTH) -> f
         return scott
     if rule == "silverman":
         return scott * (4 / (dim + 2)) ** (1 / (dim + 4))
+    if groups is not None:
+        varying_periods = None if periods is None else periods[varying]
+        held_out = HeldOut(points.cpu()[:, varying].float(), groups, varying_periods)
+        if held_out.can_judge:
+            return _most_likely_across_groups(held_out)
     return _most_likely_bandwidth(
         points.cpu()[:, varying], smallest=_SMALLEST_BANDWIDTH * spread, largest=3 * spread
     )
@@ -116,18 +150,88 @@ def _most_likely_bandwidth(points: Tensor, smallest: float, largest: float, n_po
     if len(distinct) < 2:
         return smallest
     subset = distinct[torch.linspace(0, len(distinct) - 1, min(n_points, len(distinct))).long()]
+    h = _maximise(
+        lambda bandwidth: leave_one_out_log_likelihood(subset, bandwidth), smallest=smallest, largest=largest
+    )
+    return h * (len(subset) / len(distinct)) ** (1 / (points.shape[1] + 4))
+
+
+@torch.no_grad()
+def _most_likely_across_groups(held_out: HeldOut) -> float:
+    """The bandwidth with the largest mean log density of points, each judged by other episodes.
+
+    The least likely `_LEFT_OUT_SHARE` of the points do not count. Points of an episode within a cell of `_REST` h count
+    once: a robot that stands still says nothing new, however long it does so and however its sensors tremble. The cells
+    need h, so h is found by iteration, from above.
+    """
+    spread = _robust_spread(held_out.points, held_out.periods)
+    smallest, largest = _SMALLEST_BANDWIDTH * spread, 3 * spread
+    h = spread / 4
+    for _ in range(6):
+        thinned, previous = _one_of_each_cell(held_out, _REST * h), h
+        rows = torch.linspace(0, len(thinned.points) - 1, min(_N_JUDGED, len(thinned.points))).long()
+        h = _maximise(partial(_trimmed_log_likelihood, thinned, rows), smallest, largest)
+        if abs(math.log(h / previous)) < 0.02:
+            break
+    return h
+
+
+def _trimmed_log_likelihood(held_out: HeldOut, rows: Tensor, bandwidth: float) -> float:
+    """The mean log density of the likelier of some rows, each judged by other groups [nats]."""
+    log_density = held_out.judge(bandwidth, held_out.points[rows], held_out.groups[rows]).log_density
+    known = log_density[log_density > -math.inf].double().sort().values
+    n_left_out = min(math.ceil(_LEFT_OUT_SHARE * len(known)), len(known) - 1)
+    return known[n_left_out:].mean().item()
+
+
+def _robust_spread(points: Tensor, periods: Tensor | None) -> float:
+    """The root mean square over dimensions of half the range between the 5 % and 95 % quantiles [normalised].
+
+    Dimensions in which that range is zero do not count. If it is zero in all, it is the standard deviation instead.
+    """
+    ordered = points.double().sort(dim=0).values
+    low, high = (ordered[round(share * (len(points) - 1))] for share in (0.05, 0.95))
+    halves = (high - low) / 2
+    if periods is not None:
+        halves = torch.where(periods > 0, halves.minimum(periods / 4), halves)
+    if not bool((halves > 0).any()):
+        halves = points.double().std(dim=0, correction=0)
+    return halves[halves > 0].square().mean().sqrt().item()
+
+
+def _one_of_each_cell(held_out: HeldOut, side: float) -> HeldOut:
+    """The points without those that share a cube of this side with an earlier point of their episode.
+
+    Blocks of one recording count as one episode. The order is that of the first coordinate, so it does not depend on the
+    order of the points.
+    """
+    groups = held_out.groups
+    order = held_out.points[:, 0].argsort(stable=True)
+    cells = torch.floor(held_out.points[order].double() / side)
+    key = torch.zeros_like(order) if held_out.is_one_recording else groups[order].clone()
+    for coordinate in cells.unbind(1):
+        key = key * 0x5851F42D4C957F2D + coordinate.clamp(-(2.0**62), 2.0**62).long()
+        key = key ^ ((key >> 29) & 0x7FFFFFFFF)
+    key, position = key.sort(stable=True)
+    is_first = torch.ones_like(key, dtype=torch.bool)
+    is_first[1:] = key[1:] != key[:-1]
+    kept = order[position[is_first].sort().values]
+    return HeldOut(held_out.points[kept], groups[kept], held_out.periods)
+
+
+def _maximise(function: Callable[[float], float], smallest: float, largest: float) -> float:
+    """The argument between two positive bounds with the largest value, to 1 %, by golden-section search on its log."""
     golden = (math.sqrt(5) - 1) / 2
     low, high = math.log(smallest), math.log(largest)
     left, right = high - golden * (high - low), low + golden * (high - low)
-    at_left = leave_one_out_log_likelihood(subset, math.exp(left))
-    at_right = leave_one_out_log_likelihood(subset, math.exp(right))
+    at_left, at_right = function(math.exp(left)), function(math.exp(right))
     while high - low > 0.01:
         if at_left > at_right:
             high, right, at_right = right, left, at_left
             left = high - golden * (high - low)
-            at_left = leave_one_out_log_likelihood(subset, math.exp(left))
+            at_left = function(math.exp(left))
         else:
             low, left, at_left = left, right, at_right
             right = low + golden * (high - low)
-            at_right = leave_one_out_log_likelihood(subset, math.exp(right))
-    return math.exp((low + high) / 2) * (len(subset) / len(distinct)) ** (1 / (points.shape[1] + 4))
+            at_right = function(math.exp(right))
+    return math.exp((low + high) / 2)

@@ -12,13 +12,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import math
+
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
 from lerobot_pf2mp.density import kernel_tree
-from lerobot_pf2mp.density.kernel_tree import KernelTree
-from lerobot_pf2mp.density.kernels import PAIRS_PER_BLOCK, log_kernels, log_sum_exp, mean
+from lerobot_pf2mp.density.kernel_tree import KernelTree, labels_in_leaves
+from lerobot_pf2mp.density.kernels import PAIRS_PER_BLOCK, log_kernels, log_sum_exp, mean, wrap
 
 # Queries and anchors are clamped to this many bandwidths, because larger squares would overflow.
 _FARTHEST = 5e17
@@ -34,10 +36,39 @@ class KernelSums:
     Args:
         anchors: ``(M, D)`` float32 positions of the kernels, M >= 1.
         bandwidth: Standard deviation h > 0 of the kernels.
+        periods: ``(D,)`` float32 periods of angles, 0 for other dimensions; None if there are no angles. In an angle,
+            differences between anchors and queries are the short way round.
+        groups: ``(M,)`` int64 group numbers of the anchors, each below 2^31; None if there are no groups.
     """
 
     anchors: Tensor
     bandwidth: float
+    periods: Tensor | None = None
+    groups: Tensor | None = None
+
+    def sums_without_own_group(self, queries: Tensor, groups: Tensor) -> tuple[Tensor, Tensor]:
+        """The log sums and the nearest distances over the anchors whose group number differs from the query's by over 1.
+
+        Args:
+            queries: ``(Q, D)`` float32 on the anchors' device.
+            groups: ``(Q,)`` int64 their group numbers.
+
+        Returns:
+            ``(Q,)`` log sums, and ``(Q,)`` distances to the nearest of these anchors; -inf and inf where there is none.
+        """
+        assert self.groups is not None
+        if self.has_tree:
+            return self.tree.sums_of_others(self._labels, queries, groups.int())
+        log_sums, distances = queries.new_empty(len(queries)), queries.new_empty(len(queries))
+        n_at_once = max(1, PAIRS_PER_BLOCK // len(self.anchors))
+        for some, group, log_sum, distance in zip(
+            *(x.split(n_at_once) for x in (queries, groups, log_sums, distances)), strict=True
+        ):
+            exponents = log_kernels(some - self._centre, self._centred, self.bandwidth, self.periods)
+            exponents[(group.unsqueeze(1) - self.groups).abs() <= 1] = -math.inf
+            log_sum.copy_(torch.logsumexp(exponents, dim=1))
+            distance.copy_((-2 * exponents.amax(dim=1)).sqrt() * self.bandwidth)
+        return log_sums, distances
 
     def __call__(self, queries: Tensor) -> tuple[Tensor, Tensor]:
         """The offsets to the local means, and the log sums, at queries. They are finite everywhere. Memory is O(M + Q).
@@ -56,7 +87,8 @@ class KernelSums:
         # Autocast would multiply in bfloat16.
         with torch.autocast(device_type=queries.device.type, enabled=False):
             centred = queries - self._centre
-            return (self._by_attention if queries.device.type == "cpu" else self._from_differences)(centred)
+            by_attention = queries.device.type == "cpu" and self.periods is None
+            return (self._by_attention if by_attention else self._from_differences)(centred)
 
     @property
     def has_tree(self) -> bool:
@@ -67,7 +99,12 @@ class KernelSums:
     @cached_property
     def tree(self) -> KernelTree:
         """The tree of the anchors; only valid if `has_tree`."""
-        return KernelTree.of(self.anchors, self.bandwidth)
+        return KernelTree.of(self.anchors, self.bandwidth, self.periods)
+
+    @cached_property
+    def _labels(self) -> Tensor:
+        assert self.groups is not None
+        return labels_in_leaves(self.groups, self.anchors, self.periods)
 
     def _from_differences(self, queries: Tensor) -> tuple[Tensor, Tensor]:
         offsets, log_sums = torch.empty_like(queries), torch.empty_like(queries[:, 0])
@@ -75,8 +112,14 @@ class KernelSums:
         for some, offset, log_sum in zip(
             *(x.split(n_at_once) for x in (queries, offsets, log_sums)), strict=True
         ):
-            exponents = log_kernels(some, self._centred, self.bandwidth)  # (Q, M)
-            offset.copy_(torch.softmax(exponents, dim=-1) @ self._centred - some)
+            exponents = log_kernels(some, self._centred, self.bandwidth, self.periods)  # (Q, M)
+            weights = torch.softmax(exponents, dim=-1)
+            if self.periods is None:
+                offset.copy_(weights @ self._centred - some)
+            else:
+                for d, period in enumerate(self.periods):
+                    differences = wrap(self._centred[:, d] - some[:, d, None], period)  # (Q, M)
+                    offset[:, d] = (weights * differences).sum(dim=1)
             log_sum.copy_(log_sum_exp(exponents))
         return offsets, log_sums
 

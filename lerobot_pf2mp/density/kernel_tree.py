@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lerobot_pf2mp.density.kernels import mean
+from lerobot_pf2mp.density.kernels import mean, wrap
 
 try:
     from lerobot_pf2mp.density import _kernel_tree
@@ -46,6 +46,8 @@ class KernelTree:
         leaves: ``(L, D, S)`` the anchors of each leaf, relative to the centre.
         boxes: ``(2 L - 1, 2, D)`` the lower and upper corner of each node's bounding box, relative to the centre.
         centre: ``(D,)`` the mean of the anchors. Subtracting it keeps float32 precise for points far from the origin.
+        periods: ``(D,)`` the periods of angles, 0 for other dimensions; ``(0,)`` if there are no angles. Positions in an
+            angle lie within half a period of the centre.
         exponent_per_square: log2(e) / 2h^2. Times a squared distance it is the exponent e of a kernel 2^-e.
         exponent_range: A kernel is left out if it is smaller than 2^-exponent_range times that of the nearest anchor.
     """
@@ -53,32 +55,32 @@ class KernelTree:
     leaves: Tensor
     boxes: Tensor
     centre: Tensor
+    periods: Tensor
     exponent_per_square: float
     exponent_range: float
 
     @classmethod
-    def of(cls, anchors: Tensor, bandwidth: float) -> KernelTree:
-        """Builds the tree of anchors ``(M, D)``, float32 on the CPU, M >= 1."""
-        n_anchors, dim = anchors.shape
-        size = _kernel_tree.LEAF_SIZE
+    def of(cls, anchors: Tensor, bandwidth: float, periods: Tensor | None = None) -> KernelTree:
+        """Builds the tree of anchors ``(M, D)``, float32 on the CPU, M >= 1.
+
+        Args:
+            anchors: The anchors.
+            bandwidth: The kernel bandwidth h > 0.
+            periods: ``(D,)`` periods of angles, 0 for other dimensions; None if there are no angles.
+        """
         centre = mean(anchors)
-        order = torch.empty(n_anchors, dtype=torch.int64)
-        _kernel_tree.order_points(anchors.contiguous().numpy(), order.numpy())
-        positions = torch.full((-(-n_anchors // size) * size, dim), _MISSING)
-        positions[:n_anchors] = (anchors - centre)[order].clamp(-_FARTHEST, _FARTHEST)
-        leaves = positions.view(-1, size, dim)
-        # From left to right the leaves of the last level come first. In the numbering of nodes they come last.
-        full_level = 2 ** (len(leaves).bit_length() - 1)
-        leaves = leaves.roll(-2 * (len(leaves) - full_level), dims=0)
+        positions = wrap(anchors - centre, periods).clamp(-_FARTHEST, _FARTHEST)
+        leaves = _in_leaves(positions[_order_of(anchors, periods)], _MISSING)
         return cls(
             leaves.transpose(1, 2).contiguous(),
             _boxes_around(leaves),
             centre,
+            torch.empty(0) if periods is None else periods.float().contiguous(),
             exponent_per_square=min(
                 max(math.log2(math.e) / 2 / bandwidth / bandwidth, _SMALLEST_EXPONENT_PER_SQUARE),
                 _LARGEST_EXPONENT_PER_SQUARE,
             ),
-            exponent_range=math.log2(n_anchors / _LEFT_OUT),
+            exponent_range=math.log2(len(anchors) / _LEFT_OUT),
         )
 
     def sums(self, queries: Tensor) -> tuple[Tensor, Tensor]:
@@ -91,6 +93,30 @@ class KernelTree:
             self._held, queries.numpy(), offsets.numpy(), log_sums.numpy(), torch.get_num_threads()
         )
         return offsets, log_sums
+
+    def sums_of_others(self, labels: Tensor, queries: Tensor, query_labels: Tensor) -> tuple[Tensor, Tensor]:
+        """The log sums, and the distances to the nearest anchor, over the anchors with other labels.
+
+        Args:
+            labels: ``(L, S)`` int32 labels of the anchors, see `labels_in_leaves`.
+            queries: ``(Q, D)`` float32.
+            query_labels: ``(Q,)`` int32. The anchors whose label differs from the query's by at most 1 are left out.
+
+        Returns:
+            ``(Q,)`` log sums and ``(Q,)`` distances; -inf and inf where no anchor remains.
+        """
+        queries = queries.contiguous()
+        log_sums, squares = torch.empty(len(queries)), torch.empty(len(queries))
+        _kernel_tree.sum_other_kernels(
+            self._held,
+            labels.numpy(),
+            queries.numpy(),
+            query_labels.contiguous().numpy(),
+            log_sums.numpy(),
+            squares.numpy(),
+            torch.get_num_threads(),
+        )
+        return log_sums, squares.sqrt()
 
     def offsets_to(self, targets: KernelTree, queries: Tensor, log_sum_threshold: float) -> Tensor:
         """The offsets to the nearest target, for queries with a small kernel sum.
@@ -156,13 +182,16 @@ class KernelTree:
         return steps
 
     @property
-    def _parts(self) -> tuple[Tensor, Tensor, Tensor, float, float]:
-        return self.leaves, self.boxes, self.centre, self.exponent_per_square, self.exponent_range
+    def _parts(self) -> tuple[Tensor, Tensor, Tensor, Tensor, float, float]:
+        numbers = self.exponent_per_square, self.exponent_range
+        return self.leaves, self.boxes, self.centre, self.periods, *numbers
 
     @cached_property
-    def _held(self) -> tuple[NDArray, NDArray, NDArray, float, float]:
-        leaves, boxes, centre = (x.numpy() for x in (self.leaves, self.boxes, self.centre))
-        return leaves, boxes, centre, self.exponent_per_square, self.exponent_range
+    def _held(self) -> tuple[NDArray, NDArray, NDArray, NDArray, float, float]:
+        leaves, boxes, centre, periods = (
+            x.numpy() for x in (self.leaves, self.boxes, self.centre, self.periods)
+        )
+        return leaves, boxes, centre, periods, self.exponent_per_square, self.exponent_range
 
 
 # The methods of a tree as custom operators, which compiled graphs can call. Below each: the shapes of its results.
@@ -173,11 +202,12 @@ def _sums_operator(
     leaves: Tensor,
     boxes: Tensor,
     centre: Tensor,
+    periods: Tensor,
     exponent_per_square: float,
     exponent_range: float,
     queries: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    return KernelTree(leaves, boxes, centre, exponent_per_square, exponent_range).sums(queries)
+    return KernelTree(leaves, boxes, centre, periods, exponent_per_square, exponent_range).sums(queries)
 
 
 @_sums_operator.register_fake
@@ -185,6 +215,7 @@ def _(
     leaves: Tensor,
     boxes: Tensor,
     centre: Tensor,
+    periods: Tensor,
     exponent_per_square: float,
     exponent_range: float,
     queries: Tensor,
@@ -197,11 +228,13 @@ def _steps_operator(
     leaves: Tensor,
     boxes: Tensor,
     centre: Tensor,
+    periods: Tensor,
     exponent_per_square: float,
     exponent_range: float,
     target_leaves: Tensor,
     target_boxes: Tensor,
     target_centre: Tensor,
+    target_periods: Tensor,
     target_exponent_per_square: float,
     target_exponent_range: float,
     queries: Tensor,
@@ -210,17 +243,47 @@ def _steps_operator(
     max_distance: float,
 ) -> Tensor:
     targets = KernelTree(
-        target_leaves, target_boxes, target_centre, target_exponent_per_square, target_exponent_range
+        target_leaves,
+        target_boxes,
+        target_centre,
+        target_periods,
+        target_exponent_per_square,
+        target_exponent_range,
     )
-    tree = KernelTree(leaves, boxes, centre, exponent_per_square, exponent_range)
+    tree = KernelTree(leaves, boxes, centre, periods, exponent_per_square, exponent_range)
     return tree.steps_to(targets, queries, log_sum_threshold, share, max_distance)
 
 
 @_steps_operator.register_fake
 def _(*arguments: Tensor | float) -> Tensor:
-    queries = arguments[10]
+    queries = arguments[12]
     assert isinstance(queries, Tensor)
     return queries.new_empty(queries.shape)
+
+
+def labels_in_leaves(labels: Tensor, anchors: Tensor, periods: Tensor | None = None) -> Tensor:
+    """The labels ``(M,)`` of anchors ``(M, D)`` in the order of the leaves of their tree, ``(L, S)`` int32."""
+    return _in_leaves(labels.int()[_order_of(anchors, periods)].unsqueeze(1), 0).squeeze(2).contiguous()
+
+
+def _order_of(anchors: Tensor, periods: Tensor | None) -> Tensor:
+    """The order ``(M,)`` of anchors in the leaves of their tree, from left to right."""
+    points = anchors if periods is None else wrap(anchors - mean(anchors), periods)
+    order = torch.empty(len(anchors), dtype=torch.int64)
+    _kernel_tree.order_points(points.contiguous().numpy(), order.numpy())
+    return order
+
+
+def _in_leaves(rows: Tensor, missing: float) -> Tensor:
+    """Rows ``(M, D)``, in the order of the leaves from left to right, as leaves ``(L, S, D)`` in the numbering of nodes."""
+    n_rows, dim = rows.shape
+    size = _kernel_tree.LEAF_SIZE
+    filled = torch.full((-(-n_rows // size) * size, dim), missing, dtype=rows.dtype)
+    filled[:n_rows] = rows
+    leaves = filled.view(-1, size, dim)
+    # From left to right the leaves of the last level come first. In the numbering of nodes they come last.
+    full_level = 2 ** (len(leaves).bit_length() - 1)
+    return leaves.roll(-2 * (len(leaves) - full_level), dims=0)
 
 
 def _boxes_around(leaves: Tensor) -> Tensor:

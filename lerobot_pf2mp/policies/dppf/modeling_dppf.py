@@ -28,7 +28,7 @@ class DPPFPolicy(WithoutPEFT, WithModelCard, DiffusionPolicy):
     Args:
         config: The policy's configuration.
         dataset_stats: Statistics of the training dataset; None at evaluation.
-        dataset_meta: Its metadata (not used).
+        dataset_meta: Its metadata, by which the field finds the episodes that are trained on.
     """
 
     config_class = DPPFConfig
@@ -43,7 +43,7 @@ class DPPFPolicy(WithoutPEFT, WithModelCard, DiffusionPolicy):
         **kwargs: Any,
     ) -> None:
         # Before DiffusionPolicy.__init__, which calls `reset`.
-        self.guidance = FieldGuidance(config, dataset_stats)
+        self.guidance = FieldGuidance(config, dataset_stats, dataset_meta)
         super().__init__(config, **kwargs)
 
     def forward(self, batch: dict[str, Any], *args: Any, **kwargs: Any) -> tuple[Tensor, None]:

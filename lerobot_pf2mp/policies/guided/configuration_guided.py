@@ -3,6 +3,7 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 from lerobot.configs import PolicyFeature
 
@@ -34,10 +35,15 @@ class GuidedConfig:
             `SupportMonitor`. warn and hold need the field, also with guidance_scale=0.
         n_field_points: Demonstrated actions M kept as anchors of the field.
         field_action_dims: Action dimensions the field covers; None covers all. A gripper's opening is usually left out.
-        field_bandwidth: Kernel bandwidth h [normalised action units], or how to choose it: likelihood (leave-one-out
-            maximum likelihood), scott or silverman.
-        field_threshold_quantile: Quantile of the anchors' own densities above which an action counts as safe.
+        field_bandwidth: Kernel bandwidth h [normalised action units], or how to choose it: likelihood (maximum likelihood
+            of actions that are judged by other episodes), scott or silverman.
+        field_threshold_quantile: Quantile of the demonstrated actions' densities above which an action counts as safe.
         field_alpha: Weight of the distance to the safe set, at most 0; 0 leaves that term out.
+        field_leave_out: What the density leaves out where it judges the actions it was made from (likelihood, quantile,
+            safe anchors): episode (the action's own) or nothing (the frame itself in the likelihood, nothing else).
+        field_angle_dims: Action dimensions that are angles: distances in them are the short way round. None finds those in
+            which recorded actions jump by a period between two frames.
+        field_angle_period: Period of the angles, in the dataset's units [rad; 360 for degrees].
     """
 
     guidance_scale: float = GuidanceSettings.scale
@@ -49,17 +55,14 @@ class GuidedConfig:
     field_bandwidth: float | str = FieldSettings.bandwidth
     field_threshold_quantile: float = FieldSettings.threshold_quantile
     field_alpha: float = FieldSettings.alpha
+    field_leave_out: str = FieldSettings.leave_out
+    field_angle_dims: tuple[int, ...] | None = FieldSettings.angle_dims
+    field_angle_period: float = FieldSettings.angle_period
 
     @property
     def field_settings(self) -> FieldSettings:
         """The settings with which the potential field is fitted."""
-        return _field_settings(
-            self.n_field_points,
-            self._field_dims,
-            self.field_bandwidth,
-            self.field_threshold_quantile,
-            self.field_alpha,
-        )
+        return _field_settings(*self._field_values)
 
     @property
     def guidance_settings(self) -> GuidanceSettings:
@@ -72,22 +75,30 @@ class GuidedConfig:
     def _field_dims(self) -> tuple[int, ...] | None:
         return None if self.field_action_dims is None else tuple(self.field_action_dims)
 
-    def _validate_guidance(self) -> None:
-        if self.on_unsupported not in ON_UNSUPPORTED:
-            raise ValueError(f"on_unsupported must be one of {ON_UNSUPPORTED}, got {self.on_unsupported!r}")
-        # They validate their own values. Not from the caches, which take hashable values only.
-        GuidanceSettings(self.guidance_scale, self.guidance_integrator, self.guidance_point)
-        FieldSettings(
+    @property
+    def _field_values(self) -> tuple[Any, ...]:
+        """The values of `FieldSettings`, in its order."""
+        return (
             self.n_field_points,
             self._field_dims,
             self.field_bandwidth,
             self.field_threshold_quantile,
             self.field_alpha,
+            self.field_leave_out,
+            None if self.field_angle_dims is None else tuple(self.field_angle_dims),
+            self.field_angle_period,
         )
+
+    def _validate_guidance(self) -> None:
+        if self.on_unsupported not in ON_UNSUPPORTED:
+            raise ValueError(f"on_unsupported must be one of {ON_UNSUPPORTED}, got {self.on_unsupported!r}")
+        # They validate their own values. Not from the caches, which take hashable values only.
+        GuidanceSettings(self.guidance_scale, self.guidance_integrator, self.guidance_point)
+        FieldSettings(*self._field_values)
 
     def _validate_field_dims(self, action_feature: PolicyFeature) -> None:
         action_dim = action_feature.shape[0]
-        if self.field_action_dims is not None and max(self.field_action_dims) >= action_dim:
-            raise ValueError(
-                f"field_action_dims must be below the action dimension {action_dim}, got {self.field_action_dims}"
-            )
+        for name in ("field_action_dims", "field_angle_dims"):
+            dims = getattr(self, name)
+            if dims and max(dims) >= action_dim:
+                raise ValueError(f"{name} must be below the action dimension {action_dim}, got {dims}")

@@ -10,9 +10,16 @@ import torch
 from torch import Tensor
 
 from lerobot_pf2mp.policies.guided.field_settings import FieldSettings
-from lerobot_pf2mp.potential_field import PotentialField, fit
+from lerobot_pf2mp.policies.guided.field_state import ANCHOR, OUTLYING, SAFE_ANCHOR, FieldState
+from lerobot_pf2mp.policies.guided.frame_ranks import frame_of, rank_of
+from lerobot_pf2mp.policies.guided.recorded_angles import jumps_by_a_period
+from lerobot_pf2mp.policies.guided.remarks import remarks_on_dimensions, remarks_on_outlying
+from lerobot_pf2mp.potential_field import JudgedFit, PotentialField, fit, fit_judged
 
 logger = logging.getLogger(__name__)
+
+# Largest difference of an action that is read again, relative to 1 and to the action, that is rounding.
+_SAME_ACTION = 1e-4
 
 
 class DemonstratedActions:
@@ -28,25 +35,51 @@ class DemonstratedActions:
 
     def __init__(self, settings: FieldSettings) -> None:
         self.settings = settings
+        self._forget_units()
         self._start_afresh(dataset_id=b"")
 
-    def _start_afresh(self, dataset_id: bytes) -> None:
+    def _forget_units(self) -> None:
+        self._unit = torch.empty(0)  # (D,) one recorded unit [normalised]; empty if unknown
+        self._jumps = torch.empty(0, dtype=torch.bool)  # (D,) whether recorded values jump by a period
+
+    def _start_afresh(self, dataset_id: bytes, why: str = "") -> None:
+        if why:
+            logger.warning(
+                "The potential field starts afresh, from the frames of this run: %s. The %d actions kept before are "
+                "dropped.",
+                why,
+                len(self),
+            )
         self._dataset_id = dataset_id
         self._n_shown = 0
         self._ranks = torch.empty(0, dtype=torch.int64)  # (P,) ascending
         self._points = torch.empty(0, 0)  # (P, D), in the order of the ranks
+        self._episodes = torch.empty(0, dtype=torch.int64)  # (P,) -1 if unknown
         self._fitted: tuple[FieldSettings, PotentialField] | None = None
+        self._is_outlying = torch.empty(0, dtype=torch.bool)  # (P,) of the fitted field's points
 
     def __len__(self) -> int:
         return len(self._ranks)
+
+    @property
+    def episodes(self) -> Tensor | None:
+        """``(P,)`` int64 episode numbers of the sample's frames; None if they are unknown."""
+        return self._episodes.cpu() if len(self) and bool((self._episodes >= 0).all()) else None
+
+    @property
+    def frames(self) -> Tensor:
+        """``(P,)`` int64 indices in the dataset of the sample's frames."""
+        return frame_of(self._ranks.cpu())
 
     def observe(
         self,
         actions: Tensor,
         is_pad: Tensor | None,
         frames: Tensor | None,
+        episodes: Tensor | None = None,
         *,
         settings: FieldSettings,
+        unit: Tensor | None = None,
         dataset_id: bytes = b"",
     ) -> None:
         """Adds the actions of a training batch to the sample.
@@ -56,29 +89,53 @@ class DemonstratedActions:
             is_pad: ``(B, T)`` true where a chunk reaches beyond its episode; those actions are left out.
             frames: ``(B,)`` index in the dataset of each chunk's first action. With None, every action counts as a new
                 frame.
-            settings: The settings of the sample. If their action dimensions differ from those of before, a new sample
-                starts.
-            dataset_id: Identifies the dataset and its normalisation. If it differs from that of before, a new sample
-                starts.
+            episodes: ``(B,)`` number of each chunk's episode; None if it is unknown.
+            settings: The settings of the sample. If their action dimensions differ from those of before, or they ask for
+                more points than the sample has kept, a new sample starts.
+            unit: ``(A,)`` what one unit of the recorded actions is in normalised actions, for the periods of angles; None
+                if it is unknown.
+            dataset_id: Identifies the run's frames and their normalisation. If it differs from that of before, a new
+                sample starts.
 
         Raises:
             ValueError: If an action is not finite or a dimension does not exist.
         """
-        if (dataset_id, settings.action_dims) != (self._dataset_id, self.settings.action_dims):
-            if len(self):
-                logger.info("The demonstrations have changed: the potential field is fitted to the new ones.")
-            self._start_afresh(dataset_id)
+        why = self._why_afresh(settings, dataset_id)
+        if why is not None:
+            self._forget_units()
+            self._start_afresh(dataset_id, why if len(self) else "")
         self.settings = settings
-        actions = _select_dims(actions.detach().float(), settings.action_dims)
+        actions = actions.detach().float()
+        if unit is not None:
+            self.recognise_angles(actions, is_pad, unit)
+        actions = _select_dims(actions, settings.action_dims)
         steps = torch.arange(actions.shape[1], device=actions.device)
         if frames is None:
             frames = self._n_shown + actions.shape[1] * torch.arange(len(actions), device=actions.device)
             self._n_shown += actions.shape[0] * actions.shape[1]
-        ranks = _hash(frames.to(actions.device).reshape(-1, 1) + steps)  # (B, T)
+        ranks = rank_of(frames.to(actions.device).reshape(-1, 1) + steps)  # (B, T)
+        if episodes is None:
+            episodes = torch.full((len(actions),), -1)
+        episodes = episodes.to(actions.device).reshape(-1, 1).expand_as(ranks)
         keep = torch.ones_like(ranks, dtype=torch.bool) if is_pad is None else ~is_pad
         if len(self) >= settings.n_points:
-            keep = keep & (ranks < self._ranks[settings.n_points - 1].to(ranks.device))
-        self._merge(ranks[keep], actions[keep])
+            keep = keep & (ranks <= self._ranks[settings.n_points - 1].to(ranks.device))
+        self._merge(ranks[keep], actions[keep], episodes[keep])
+
+    def recognise_angles(self, actions: Tensor, is_pad: Tensor | None, unit: Tensor) -> None:
+        """Looks for jumps by a period in successive actions, which make their dimension an angle.
+
+        Args:
+            actions: ``(B, T, A)`` successive actions [normalised].
+            is_pad: ``(B, T)`` true where an action does not follow the one before it.
+            unit: ``(A,)`` what one unit of the recorded actions is in normalised actions.
+        """
+        self._unit = _select_dims(unit.float(), self.settings.action_dims).cpu()
+        actions = _select_dims(actions, self.settings.action_dims)
+        jumps = jumps_by_a_period(actions, is_pad, self._unit * self.settings.angle_period)
+        if bool((jumps & ~self._jumps).any()) if len(self._jumps) else bool(jumps.any()):
+            self._fitted = None
+        self._jumps = jumps | self._jumps if len(self._jumps) else jumps
 
     def field(
         self, settings: FieldSettings | None = None, device: torch.device | str = "cpu"
@@ -93,48 +150,55 @@ class DemonstratedActions:
             The field. It is fitted at the first call, and again after its frames or settings have changed.
 
         Raises:
-            ValueError: If there are no frames yet, or the settings have other action dimensions than the sample.
+            ValueError: If there are no frames yet, or the settings have other action dimensions than the sample, ask for
+                more points than it has kept, or name angles whose unit is unknown.
         """
         settings = settings or self.settings
-        if not len(self):
-            raise ValueError(
-                "the potential field is not fitted: it has seen no demonstrations. Train the policy, load a checkpoint "
-                "whose preprocessor holds the field, or set guidance_scale=0"
-            )
-        if settings.action_dims != self.settings.action_dims:
-            raise ValueError(
-                f"field_action_dims must be {self.settings.action_dims}, as in training, got {settings.action_dims}"
-            )
+        self._check(settings)
         if self._fitted is None or self._fitted[0] != settings:
             if self._fitted is not None and replace(self._fitted[0], alpha=settings.alpha) == settings:
-                fitted = self._fitted[1]
-                field = PotentialField(
-                    fitted.anchors, fitted.bandwidth, fitted.log_threshold, alpha=settings.alpha
-                )
+                field = replace(self._fitted[1], alpha=settings.alpha)
             else:
-                field = fit(
-                    self._points[: settings.n_points].cpu(),
-                    bandwidth=settings.bandwidth,
-                    threshold_quantile=settings.threshold_quantile,
-                    alpha=settings.alpha,
-                )
+                field = self._fit(settings)
             self._fitted = (settings, field)
         self._fitted = (settings, self._fitted[1].to(device))
         return self._fitted[1]
+
+    def judged(self, settings: FieldSettings | None = None) -> JudgedFit:
+        """The field, fitted anew, and how each of its points is judged by other episodes. Arguments and errors as above."""
+        settings = settings or self.settings
+        self._check(settings)
+        n_points = settings.n_points
+        return fit_judged(
+            self._points[:n_points].cpu(),
+            episodes=None if self.episodes is None else self.episodes[:n_points],
+            times=self.frames[:n_points],
+            periods=self._periods(settings),
+            bandwidth=settings.bandwidth,
+            threshold_quantile=settings.threshold_quantile,
+            alpha=settings.alpha,
+        )
 
     def state_dict(self) -> dict[str, Tensor]:
         """The sample and the fitted field as CPU tensors; empty if there are no frames yet."""
         if not len(self):
             return {}
         field = self.field()
-        return {
-            "points": self._points.cpu().contiguous(),
-            "ranks": self._ranks.cpu().contiguous(),
-            "n_shown": torch.tensor(self._n_shown),
-            "dataset_id": torch.tensor(list(self._dataset_id), dtype=torch.uint8),
-            "bandwidth": torch.tensor(field.bandwidth, dtype=torch.float64),
-            "log_threshold": torch.tensor(field.log_threshold, dtype=torch.float64),
-        }
+        is_outlying = self._is_outlying
+        role = torch.where(is_outlying, OUTLYING, ANCHOR).to(torch.uint8)
+        role[~is_outlying] += field.safe_anchors.cpu().to(torch.uint8)
+        return FieldState(
+            points=self._points.cpu().contiguous(),
+            ranks=self._ranks.cpu().contiguous(),
+            n_shown=torch.tensor(self._n_shown),
+            dataset_id=torch.tensor(list(self._dataset_id), dtype=torch.uint8),
+            bandwidth=torch.tensor(field.bandwidth, dtype=torch.float64),
+            log_threshold=torch.tensor(field.log_threshold, dtype=torch.float64),
+            episodes=self._episodes.cpu().contiguous(),
+            unit=self._unit.clone(),
+            jumps=self._jumps.clone(),
+            role=role,
+        ).tensors()
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Restores the sample and the fitted field bit for bit.
@@ -145,40 +209,96 @@ class DemonstratedActions:
         Raises:
             ValueError: If an entry is missing or of the wrong kind, as in a corrupted file.
         """
-        wanted = {"points", "ranks", "n_shown", "dataset_id", "bandwidth", "log_threshold"}
-        if not wanted <= set(state):
+        read = FieldState.read(state)
+        dims, dim = self.settings.action_dims, read.points.shape[1]
+        if dims is not None and dim != len(dims):
             raise ValueError(
-                f"a potential field file must hold {sorted(wanted)}, got {sorted(state)}: it is corrupted"
+                f"the potential field file must cover the action dimensions {dims}, got points of {dim}"
             )
-        points, ranks = state["points"], state["ranks"]
-        dims = self.settings.action_dims
-        if points.ndim != 2 or ranks.shape != points.shape[:1] or not torch.isfinite(points).all():
-            raise ValueError(
-                "a potential field file must hold finite points (P, D) with P ranks, got points "
-                f"{tuple(points.shape)} and ranks {tuple(ranks.shape)}: it is corrupted"
-            )
-        if dims is not None and points.shape[1] != len(dims):
-            raise ValueError(
-                f"the potential field file must cover the action dimensions {dims}, got points of {points.shape[1]}"
-            )
-        for name in ("n_shown", "bandwidth", "log_threshold"):
-            if state[name].numel() != 1:
-                raise ValueError(
-                    f"{name} in a potential field file must be one number, got {tuple(state[name].shape)}: "
-                    "it is corrupted"
-                )
-        self._points, self._ranks = points.float(), ranks
-        self._n_shown = int(state["n_shown"])
-        self._dataset_id = bytes(state["dataset_id"].tolist())
+        self._points, self._ranks, self._episodes = read.points.float(), read.ranks, read.episodes
+        self._unit, self._jumps = read.unit.float(), read.jumps
+        self._n_shown = int(read.n_shown)
+        self._dataset_id = bytes(read.dataset_id.tolist())
+        role = read.role[: self.settings.n_points]
+        self._is_outlying = role == OUTLYING
         field = PotentialField(
-            self._points[: self.settings.n_points],
-            bandwidth=state["bandwidth"].item(),
-            log_threshold=state["log_threshold"].item(),
+            self._points[: self.settings.n_points][~self._is_outlying],
+            bandwidth=read.bandwidth.item(),
+            log_threshold=read.log_threshold.item(),
             alpha=self.settings.alpha,
+            periods=self._periods(self.settings),
+            # A file of before has no roles. Its safe anchors are those whose own density is above the threshold.
+            anchor_is_safe=role[~self._is_outlying] == SAFE_ANCHOR if "role" in state else None,
         )
         self._fitted = (self.settings, field)
 
-    def _merge(self, ranks: Tensor, points: Tensor) -> None:
+    def _check(self, settings: FieldSettings) -> None:
+        if not len(self):
+            raise ValueError(
+                "the potential field is not fitted: it has seen no demonstrations. Train the policy, load a checkpoint "
+                "whose preprocessor holds the field, or set guidance_scale=0"
+            )
+        if settings.action_dims != self.settings.action_dims:
+            raise ValueError(
+                f"field_action_dims must be {self.settings.action_dims}, as in training, got {settings.action_dims}"
+            )
+        if settings.n_points > max(len(self), self.settings.n_points):
+            raise ValueError(
+                f"n_field_points must be at most {len(self)}, the number of actions kept with the checkpoint, got "
+                f"{settings.n_points}; pf2mp-fit-field keeps more"
+            )
+
+    def _fit(self, settings: FieldSettings) -> PotentialField:
+        """Fits the field, and says what is remarkable about the points."""
+        points = self._points[: settings.n_points].cpu()
+        dims = settings.action_dims or tuple(range(points.shape[1]))
+        if settings.leave_out == "nothing":
+            self._is_outlying = torch.zeros(len(points), dtype=torch.bool)
+            field = fit(
+                points,
+                periods=self._periods(settings),
+                bandwidth=settings.bandwidth,
+                threshold_quantile=settings.threshold_quantile,
+                alpha=settings.alpha,
+                leave_out="nothing",
+            )
+        else:
+            judged = self.judged(settings)
+            field, self._is_outlying = judged.field, judged.is_outlying
+            remark = remarks_on_outlying(judged, self.episodes, self.frames)
+            if remark:
+                logger.warning(remark)
+        remark = remarks_on_dimensions(points[~self._is_outlying], field.bandwidth, dims)
+        if remark:
+            logger.warning(remark)
+        return field
+
+    def _periods(self, settings: FieldSettings) -> Tensor | None:
+        """``(D,)`` the periods of the field's dimensions [normalised], 0 for those that are no angles."""
+        dims = settings.action_dims or tuple(range(self._points.shape[1]))
+        if settings.angle_dims is None:
+            is_angle = self._jumps
+        else:
+            if settings.angle_dims and not len(self._unit):
+                raise ValueError(
+                    f"field_angle_dims must be empty or null, got {settings.angle_dims}: the field does not know how "
+                    "the recorded actions were normalised. pf2mp-fit-field makes a field that does"
+                )
+            is_angle = torch.tensor([dim in settings.angle_dims for dim in dims])
+        if not bool(is_angle.any()):
+            return None
+        return torch.where(is_angle, self._unit * settings.angle_period, 0.0)
+
+    def _why_afresh(self, settings: FieldSettings, dataset_id: bytes) -> str | None:
+        if dataset_id != self._dataset_id:
+            return "its dataset, episodes or normalisation differ from those of before"
+        if settings.action_dims != self.settings.action_dims:
+            return f"field_action_dims are {settings.action_dims}, before {self.settings.action_dims}"
+        if settings.n_points > self.settings.n_points and len(self) >= self.settings.n_points:
+            return f"n_field_points is {settings.n_points}, before {self.settings.n_points}"
+        return None
+
+    def _merge(self, ranks: Tensor, points: Tensor, episodes: Tensor) -> None:
         if not len(ranks):
             return
         if not torch.isfinite(points).all():
@@ -186,17 +306,24 @@ class DemonstratedActions:
                 "demonstrated actions must be finite, got NaN or infinite values in the training batch"
             )
         if len(self):
-            known = self._ranks.to(ranks.device)
-            closest = known[torch.searchsorted(known, ranks).clamp_max(len(known) - 1)]
-            if torch.equal(closest, ranks) and len(self) <= self.settings.n_points:
+            known, known_points = self._ranks.to(ranks.device), self._points.to(points.device)
+            place = torch.searchsorted(known, ranks).clamp_max(len(known) - 1)
+            is_known = known[place] == ranks
+            difference = (known_points[place] - points).abs()
+            if bool((is_known & (difference > _SAME_ACTION * (1 + points.abs())).any(dim=-1)).any()):
+                self._start_afresh(self._dataset_id, "its frames have other actions than before")
+            elif bool(is_known.all()) and len(self) <= self.settings.n_points:
                 return  # no new frames: the fitted field stays valid
-            ranks = torch.cat([ranks, known])
-            points = torch.cat([points, self._points.to(points.device)])
+            else:
+                ranks, points = torch.cat([ranks, known]), torch.cat([points, known_points])
+                episodes = torch.cat([episodes, self._episodes.to(episodes.device)])
         ranks, order = ranks.sort(stable=True)
         is_first = torch.ones_like(ranks, dtype=torch.bool)
         is_first[1:] = ranks[1:] != ranks[:-1]  # the hash is one to one: an equal rank is the same frame
-        self._ranks = ranks[is_first][: self.settings.n_points]
-        self._points = points[order][is_first][: self.settings.n_points]
+        n_points = self.settings.n_points
+        self._ranks = ranks[is_first][:n_points]
+        self._points = points[order][is_first][:n_points]
+        self._episodes = episodes[order][is_first][:n_points]
         self._fitted = None
 
 
@@ -208,11 +335,3 @@ def _select_dims(actions: Tensor, dims: tuple[int, ...] | None) -> Tensor:
             f"field_action_dims must be below the action dimension {actions.shape[-1]}, got {dims}"
         )
     return actions[..., list(dims)]
-
-
-def _hash(x: Tensor) -> Tensor:
-    """A one-to-one scrambling of int64 numbers: the finaliser of splitmix64 (Steele et al., 2014)."""
-    x = x + -0x61C8864680B583EB
-    x = (x ^ ((x >> 30) & 0x3FFFFFFFF)) * -0x40A7B892E31B1A47
-    x = (x ^ ((x >> 27) & 0x1FFFFFFFFF)) * -0x6B2FB644ECCEEE15
-    return x ^ ((x >> 31) & 0x1FFFFFFFF)

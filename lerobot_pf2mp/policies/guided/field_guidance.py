@@ -17,10 +17,12 @@ from torch import Tensor
 from lerobot_pf2mp.flow_matching import Guide
 from lerobot_pf2mp.guidance import GuidanceSettings, make_guide
 from lerobot_pf2mp.policies.batch_keys import ACTION_IS_PAD, POTENTIAL_FIELD
+from lerobot_pf2mp.policies.guided.action_units import normalised_unit, normaliser_of
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
 from lerobot_pf2mp.policies.guided.support_monitor import SupportMonitor
 from lerobot_pf2mp.potential_field import PotentialField
 from lerobot_pf2mp.training.gathering import gather_rows
+from lerobot_pf2mp.training.run_dataset import run_episodes
 
 if TYPE_CHECKING:
     from lerobot_pf2mp.policies.dppf.configuration_dppf import DPPFConfig
@@ -37,13 +39,18 @@ class FieldGuidance:
     Args:
         config: The policy's configuration. Its options may change between two calls.
         dataset_stats: Statistics of the training dataset; None at evaluation.
+        dataset_meta: Its metadata; None at evaluation.
     """
 
     def __init__(
-        self, config: GuidedPolicyConfig, dataset_stats: dict[str, dict[str, Any]] | None = None
+        self,
+        config: GuidedPolicyConfig,
+        dataset_stats: dict[str, dict[str, Any]] | None = None,
+        dataset_meta: Any = None,
     ) -> None:
         self.config = config
-        self._dataset_id = _identify_dataset(dataset_stats, config)
+        self._dataset_id = _identify_dataset(dataset_stats, run_episodes(dataset_meta), config)
+        self._unit = _unit_of_actions(dataset_stats, config)
         self.demonstrations: DemonstratedActions | None = None  # those of the last training batch
         self._monitor = SupportMonitor(config.on_unsupported, config.field_action_dims)
         self._made: tuple[PotentialField, GuidanceSettings, Guide | None] | None = None
@@ -68,7 +75,7 @@ class FieldGuidance:
         """Adds the actions of a training batch to the field in that batch. A batch without a field changes nothing.
 
         With several processes, the field of each process gets the batches of all, because only the main process saves its
-        field. They exchange B x T x (4 A + 1) bytes in every step, which is little compared with the gradients.
+        field. They exchange B x (T x (4 A + 1) + 16) bytes in every step, which is little compared with the gradients.
 
         Args:
             batch: A training batch that the policy's own preprocessor has made.
@@ -77,12 +84,16 @@ class FieldGuidance:
         if demonstrations is None:
             return
         self.demonstrations = demonstrations
-        actions, is_pad, frames = gather_rows(batch[ACTION], batch.get(ACTION_IS_PAD), batch.get("index"))
+        actions, is_pad, frames, episodes = gather_rows(
+            batch[ACTION], batch.get(ACTION_IS_PAD), batch.get("index"), batch.get("episode_index")
+        )
         demonstrations.observe(
             cast(Tensor, actions),
             is_pad,
             None if frames is None else frames + self.config.action_delta_indices[0],
+            episodes,
             settings=self.config.field_settings,
+            unit=self._unit,
             dataset_id=self._dataset_id,
         )
 
@@ -155,11 +166,22 @@ def fitted_field(
     return field
 
 
-def _identify_dataset(dataset_stats: dict[str, dict[str, Any]] | None, config: GuidedPolicyConfig) -> bytes:
-    """A digest of the action statistics and their normalisation, which tells resuming from fine-tuning.
+def _unit_of_actions(
+    dataset_stats: dict[str, dict[str, Any]] | None, config: GuidedPolicyConfig
+) -> Tensor | None:
+    if not dataset_stats or ACTION not in dataset_stats:
+        return None
+    return normalised_unit(normaliser_of(config, dataset_stats), config.action_feature.shape[0])
 
-    LeRobot reloads the saved preprocessor in both cases. With the same digest, the saved sample continues. With another
-    digest, its points belong to other data or have other units, so a new sample starts.
+
+def _identify_dataset(
+    dataset_stats: dict[str, dict[str, Any]] | None, episodes: list[int] | None, config: GuidedPolicyConfig
+) -> bytes:
+    """A digest of the action statistics, their normalisation and the run's episodes.
+
+    LeRobot reloads the saved preprocessor both when a run resumes and when another run starts from a checkpoint. With the
+    same digest, the saved sample continues. With another digest, its points belong to other data or have other units, so a
+    new sample starts.
     """
     if not dataset_stats or ACTION not in dataset_stats:
         return b""
@@ -167,4 +189,6 @@ def _identify_dataset(dataset_stats: dict[str, dict[str, Any]] | None, config: G
     for name, value in sorted(dataset_stats[ACTION].items()):
         digest.update(name.encode())
         digest.update(np.asarray(value, dtype=np.float64).tobytes())
+    if episodes is not None:
+        digest.update(np.asarray(sorted(episodes), dtype=np.int64).tobytes())
     return digest.digest()

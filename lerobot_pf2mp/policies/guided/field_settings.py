@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from lerobot_pf2mp.density.bandwidth import DEFAULT_BANDWIDTH, check_bandwidth_rule
 from lerobot_pf2mp.potential_field import (
+    LEFT_OUT,
     THRESHOLD_QUANTILE,
     check_alpha,
+    check_left_out,
     check_threshold_quantile,
 )
 
@@ -21,8 +24,12 @@ class FieldSettings:
         n_points: Largest number of demonstrated actions that are kept as anchors (M in the paper, which uses 3000).
         action_dims: Action dimensions that the field covers; None covers all.
         bandwidth: A rule of `BANDWIDTH_RULES`, or the kernel bandwidth h itself [normalised].
-        threshold_quantile: Quantile of the anchors' own log densities that bounds the safe set.
+        threshold_quantile: Quantile of the actions' log densities that bounds the safe set.
         alpha: Weight of the distance term, at most 0.
+        leave_out: What is left out of the density where it judges its own actions, one of `LEFT_OUT`.
+        angle_dims: Action dimensions that are angles, among those that the field covers. None: those in which recorded
+            actions jump by a period from one frame to the next.
+        angle_period: The period of these angles, in the units of the recorded actions [rad, or degrees with 360].
 
     Raises:
         ValueError: If a value breaks its rule. The message names the option of the policy's configuration.
@@ -33,20 +40,35 @@ class FieldSettings:
     bandwidth: float | str = DEFAULT_BANDWIDTH
     threshold_quantile: float = THRESHOLD_QUANTILE
     alpha: float = -0.1
+    leave_out: str = LEFT_OUT[0]
+    angle_dims: tuple[int, ...] | None = None
+    angle_period: float = 2 * math.pi
 
     def __post_init__(self) -> None:
         if self.n_points < 1:
             raise ValueError(f"n_field_points must be at least 1, got {self.n_points}")
         if self.action_dims is not None:
             object.__setattr__(self, "action_dims", tuple(self.action_dims))
-            if (
-                not self.action_dims
-                or min(self.action_dims) < 0
-                or len(set(self.action_dims)) < len(self.action_dims)
-            ):
+            _check_dims("field_action_dims", self.action_dims)
+            if not self.action_dims:
+                raise ValueError("field_action_dims must name at least one dimension, got ()")
+        if self.angle_dims is not None:
+            object.__setattr__(self, "angle_dims", tuple(self.angle_dims))
+            _check_dims("field_angle_dims", self.angle_dims)
+            if self.action_dims is not None and not set(self.angle_dims) <= set(self.action_dims):
                 raise ValueError(
-                    f"field_action_dims must be distinct indices from 0 on, got {self.action_dims}"
+                    f"field_angle_dims must be among field_action_dims {self.action_dims}, got {self.angle_dims}"
                 )
+        if not (self.angle_period > 0 and math.isfinite(self.angle_period)):
+            raise ValueError(f"field_angle_period must be finite and positive, got {self.angle_period}")
+        check_left_out(self.leave_out, "field_leave_out")
         check_bandwidth_rule(self.bandwidth, "field_bandwidth")
         check_threshold_quantile(self.threshold_quantile, "field_threshold_quantile")
         check_alpha(self.alpha, "field_alpha")
+
+
+def _check_dims(name: str, dims: tuple[int, ...]) -> None:
+    if any(isinstance(dim, bool) or not isinstance(dim, int) for dim in dims):
+        raise ValueError(f"{name} must be whole numbers, got {dims}")
+    if min(dims, default=0) < 0 or len(set(dims)) < len(dims):
+        raise ValueError(f"{name} must be distinct indices from 0 on, got {dims}")

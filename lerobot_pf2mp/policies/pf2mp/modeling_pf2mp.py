@@ -26,7 +26,7 @@ class PF2MPPolicy(FMPPolicy):
     Args:
         config: The policy's configuration.
         dataset_stats: Statistics of the training dataset; None at evaluation.
-        dataset_meta: Its metadata (not used).
+        dataset_meta: Its metadata, by which the field finds the episodes that are trained on.
     """
 
     config_class = PF2MPConfig
@@ -41,7 +41,7 @@ class PF2MPPolicy(FMPPolicy):
         **kwargs: Any,
     ) -> None:
         # Before FMPPolicy.__init__, which calls `reset`.
-        self.guidance = FieldGuidance(config, dataset_stats)
+        self.guidance = FieldGuidance(config, dataset_stats, dataset_meta)
         super().__init__(config, dataset_stats, dataset_meta, **kwargs)
 
     def forward(self, batch: dict[str, Any], reduction: str = "mean") -> tuple[Tensor, None]:
