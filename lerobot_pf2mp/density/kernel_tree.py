@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lerobot_pf2mp.density.kernels import mean
+from lerobot_pf2mp.density.kernels import checked_periods, mean, without_angles, wrap
 
 try:
     from lerobot_pf2mp.density import _kernel_tree
@@ -36,6 +36,25 @@ def is_available() -> bool:
     return _kernel_tree is not None
 
 
+def check_groups(groups: Tensor, count: int) -> None:
+    """Checks the group numbers of points.
+
+    Args:
+        groups: The group numbers.
+        count: The number of points.
+
+    Raises:
+        ValueError: If they are not ``(count,)`` int64, or do not fit into 32 bits.
+    """
+    if groups.shape != (count,) or groups.dtype != torch.int64:
+        raise ValueError(f"groups must be ({count},) int64, got {tuple(groups.shape)} {groups.dtype}")
+    # The neighbours of a group number must fit too.
+    if count and not (groups.min() > -(2**31) and groups.max() < 2**31 - 1):
+        raise ValueError(
+            f"group numbers must fit into 32 bits, got {groups.min().item()} to {groups.max().item()}"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class KernelTree:
     """A binary tree of L leaves that is full except for its last level.
@@ -45,23 +64,47 @@ class KernelTree:
     Args:
         leaves: ``(L, D, S)`` the anchors of each leaf, relative to the centre.
         boxes: ``(2 L - 1, 2, D)`` the lower and upper corner of each node's bounding box, relative to the centre.
-        centre: ``(D,)`` the mean of the anchors. Subtracting it keeps float32 precise for points far from the origin.
+        centre: ``(D,)`` the mean of the anchors, zero for angles. Subtracting it keeps float32 precise for points far from
+            the origin.
+        periods: ``(D,)`` the periods of angles, 0 for other dimensions; ``(0,)`` if there are no angles.
         exponent_per_square: log2(e) / 2h^2. Times a squared distance it is the exponent e of a kernel 2^-e.
         exponent_range: A kernel is left out if it is smaller than 2^-exponent_range times that of the nearest anchor.
+        labels: ``(L, S)`` int32 group numbers of the anchors in the leaves, for `sums_without_own_group`.
     """
 
     leaves: Tensor
     boxes: Tensor
     centre: Tensor
+    periods: Tensor
     exponent_per_square: float
     exponent_range: float
+    labels: Tensor | None = None
 
     @classmethod
-    def of(cls, anchors: Tensor, bandwidth: float) -> KernelTree:
-        """Builds the tree of anchors ``(M, D)``, float32 on the CPU, M >= 1."""
+    def of(
+        cls,
+        anchors: Tensor,
+        bandwidth: float,
+        periods: Tensor | None = None,
+        groups: Tensor | None = None,
+    ) -> KernelTree:
+        """Builds the tree of anchors.
+
+        Args:
+            anchors: ``(M, D)`` float32 on the CPU, M >= 1.
+            bandwidth: Standard deviation h > 0 of the kernels.
+            periods: ``(D,)`` the periods of angles, 0 for other dimensions; None stands for zeros.
+            groups: ``(M,)`` int64 group numbers, for `sums_without_own_group`.
+
+        Raises:
+            ValueError: If the periods or the groups are not those that `KernelSums` accepts.
+        """
         n_anchors, dim = anchors.shape
         size = _kernel_tree.LEAF_SIZE
-        centre = mean(anchors)
+        periods = checked_periods(periods, dim)
+        centre = without_angles(mean(anchors), periods)
+        if periods is not None:
+            anchors = wrap(anchors, periods)
         order = torch.empty(n_anchors, dtype=torch.int64)
         _kernel_tree.order_points(anchors.contiguous().numpy(), order.numpy())
         positions = torch.full((-(-n_anchors // size) * size, dim), _MISSING)
@@ -69,16 +112,25 @@ class KernelTree:
         leaves = positions.view(-1, size, dim)
         # From left to right the leaves of the last level come first. In the numbering of nodes they come last.
         full_level = 2 ** (len(leaves).bit_length() - 1)
-        leaves = leaves.roll(-2 * (len(leaves) - full_level), dims=0)
+        n_rolled = 2 * (len(leaves) - full_level)
+        leaves = leaves.roll(-n_rolled, dims=0)
+        labels = None
+        if groups is not None:
+            check_groups(groups, n_anchors)
+            labels = torch.zeros(len(positions), dtype=torch.int32)
+            labels[:n_anchors] = groups[order].int()
+            labels = labels.view(-1, size).roll(-n_rolled, dims=0)
         return cls(
             leaves.transpose(1, 2).contiguous(),
             _boxes_around(leaves),
             centre,
+            centre.new_empty(0) if periods is None else periods,
             exponent_per_square=min(
                 max(math.log2(math.e) / 2 / bandwidth / bandwidth, _SMALLEST_EXPONENT_PER_SQUARE),
                 _LARGEST_EXPONENT_PER_SQUARE,
             ),
             exponent_range=math.log2(n_anchors / _LEFT_OUT),
+            labels=labels,
         )
 
     def sums(self, queries: Tensor) -> tuple[Tensor, Tensor]:
@@ -92,11 +144,28 @@ class KernelTree:
         )
         return offsets, log_sums
 
+    def sums_without_own_group(self, queries: Tensor, groups: Tensor) -> tuple[Tensor, Tensor]:
+        """The log sums and distances of `KernelSums.sums_without_own_group`, for a tree with labels."""
+        if self.labels is None:
+            raise ValueError("the anchors must have groups, got None")
+        check_groups(groups, len(queries))
+        log_sums, distances = torch.empty(len(queries)), torch.empty(len(queries))
+        _kernel_tree.sum_other_kernels(
+            self._held,
+            self.labels.numpy(),
+            queries.contiguous().numpy(),
+            groups.int().contiguous().numpy(),
+            log_sums.numpy(),
+            distances.numpy(),
+            torch.get_num_threads(),
+        )
+        return log_sums, distances
+
     def offsets_to(self, targets: KernelTree, queries: Tensor, log_sum_threshold: float) -> Tensor:
         """The offsets to the nearest target, for queries with a small kernel sum.
 
         Args:
-            targets: The tree of the target points.
+            targets: The tree of the target points, with the same periods.
             queries: ``(Q, D)`` float32.
             log_sum_threshold: Log sum above which the offset is zero.
 
@@ -128,7 +197,7 @@ class KernelTree:
         """Steps towards the local mean, and from there towards the nearest target if the kernel sum there is small.
 
         Args:
-            targets: The tree of the target points.
+            targets: The tree of the target points, with the same periods.
             queries: ``(Q, D)`` float32.
             log_sum_threshold: Log sum at the end of the first part above which there is no part towards a target.
             share: Fraction in [0, 1] of the offset to the local mean that a step covers.
@@ -156,13 +225,15 @@ class KernelTree:
         return steps
 
     @property
-    def _parts(self) -> tuple[Tensor, Tensor, Tensor, float, float]:
-        return self.leaves, self.boxes, self.centre, self.exponent_per_square, self.exponent_range
+    def _parts(self) -> tuple[Tensor, Tensor, Tensor, Tensor, float, float]:
+        arrays = self.leaves, self.boxes, self.centre, self.periods
+        return *arrays, self.exponent_per_square, self.exponent_range
 
     @cached_property
-    def _held(self) -> tuple[NDArray, NDArray, NDArray, float, float]:
-        leaves, boxes, centre = (x.numpy() for x in (self.leaves, self.boxes, self.centre))
-        return leaves, boxes, centre, self.exponent_per_square, self.exponent_range
+    def _held(self) -> tuple[NDArray, NDArray, NDArray, NDArray, float, float]:
+        leaves, boxes, centre, periods, exponent_per_square, exponent_range = self._parts
+        arrays = leaves.numpy(), boxes.numpy(), centre.numpy(), periods.numpy()
+        return *arrays, exponent_per_square, exponent_range
 
 
 # The methods of a tree as custom operators, which compiled graphs can call. Below each: the shapes of its results.
@@ -173,11 +244,12 @@ def _sums_operator(
     leaves: Tensor,
     boxes: Tensor,
     centre: Tensor,
+    periods: Tensor,
     exponent_per_square: float,
     exponent_range: float,
     queries: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    return KernelTree(leaves, boxes, centre, exponent_per_square, exponent_range).sums(queries)
+    return KernelTree(leaves, boxes, centre, periods, exponent_per_square, exponent_range).sums(queries)
 
 
 @_sums_operator.register_fake
@@ -185,6 +257,7 @@ def _(
     leaves: Tensor,
     boxes: Tensor,
     centre: Tensor,
+    periods: Tensor,
     exponent_per_square: float,
     exponent_range: float,
     queries: Tensor,
@@ -197,11 +270,13 @@ def _steps_operator(
     leaves: Tensor,
     boxes: Tensor,
     centre: Tensor,
+    periods: Tensor,
     exponent_per_square: float,
     exponent_range: float,
     target_leaves: Tensor,
     target_boxes: Tensor,
     target_centre: Tensor,
+    target_periods: Tensor,
     target_exponent_per_square: float,
     target_exponent_range: float,
     queries: Tensor,
@@ -210,15 +285,20 @@ def _steps_operator(
     max_distance: float,
 ) -> Tensor:
     targets = KernelTree(
-        target_leaves, target_boxes, target_centre, target_exponent_per_square, target_exponent_range
+        target_leaves,
+        target_boxes,
+        target_centre,
+        target_periods,
+        target_exponent_per_square,
+        target_exponent_range,
     )
-    tree = KernelTree(leaves, boxes, centre, exponent_per_square, exponent_range)
+    tree = KernelTree(leaves, boxes, centre, periods, exponent_per_square, exponent_range)
     return tree.steps_to(targets, queries, log_sum_threshold, share, max_distance)
 
 
 @_steps_operator.register_fake
 def _(*arguments: Tensor | float) -> Tensor:
-    queries = arguments[10]
+    queries = arguments[12]
     assert isinstance(queries, Tensor)
     return queries.new_empty(queries.shape)
 
