@@ -159,9 +159,9 @@ static float wrapped(float x, float period) {
     return remainderf(x < -FLT_MAX ? -FLT_MAX : x > FLT_MAX ? FLT_MAX : x, period);
 }
 
-/* x - q, for angles to the nearest image of x. `halves` are half periods, infinite for other dimensions; NULL if there are
-   no angles. Half a period is taken from each of x and q: their difference is close to a whole period where the images
-   are close to each other, so it would lose their digits. */
+/* x - q, for angles to the nearest image of x. `halves` are half periods, infinite for other dimensions; NULL if there
+   are no angles. Half a period is taken from each of x and q: their difference is close to a whole period where the
+   images are close to each other, so it would lose their digits. */
 INLINE float offset_to(float x, float q, const float *halves, Py_ssize_t d) {
     const float offset = x - q;
     if (!halves || !(fabsf(offset) > halves[d])) return offset;
@@ -830,7 +830,7 @@ static PyObject *step_to_targets(PyObject *module, PyObject *args) {
 static PyMethodDef methods[] = {
     {"order_points", order_points, METH_VARARGS, "Sorts points into leaves."},
     {"sum_kernels", sum_kernels, METH_VARARGS, "The offsets to local means, and the logarithms of the sums."},
-    {"sum_other_kernels", sum_other_kernels, METH_VARARGS, "The same without some anchors; distances instead of offsets."},
+    {"sum_other_kernels", sum_other_kernels, METH_VARARGS, "The same without some anchors, and distances."},
     {"lead_to_targets", lead_to_targets, METH_VARARGS, "The offsets to the nearest target where the log sum is low."},
     {"step_to_targets", step_to_targets, METH_VARARGS, "The steps to local means and, at a low log sum, to targets."},
     {NULL, NULL, 0, NULL},
