@@ -141,7 +141,7 @@ def test_a_way_that_only_one_episode_went_is_kept_but_not_safe():
     assert not judged.is_outlying.any()
     far = alone & (detour[:, 1] > 1.3)
     assert far.sum() > 10
-    assert not judged.field.anchor_is_safe[far].any()
+    assert not judged.field.safe_anchors[far].any()
     assert judged.field.bandwidth == pytest.approx(fit(points, episodes=episodes).bandwidth, rel=0.3)
 
 

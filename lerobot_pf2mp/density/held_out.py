@@ -210,7 +210,10 @@ class HeldOut:
         rows = order[1:][episode[order[1:]] == episode[order[:-1]]]
         if not len(rows):
             return before, rows
-        steps = wrap(self.points[rows] - self.points[before[rows]], self.periods).double().norm(dim=1)
+        offsets = self.points[rows] - self.points[before[rows]]
+        if self.periods is not None:
+            offsets = wrap(offsets, self.periods)
+        steps = offsets.double().norm(dim=1)
         durations = (times[rows] - times[before[rows]]).clamp_min(1).double()
         speeds = steps / durations
         usual = speeds.kthvalue(max(1, math.ceil(_USUAL_SPEED_QUANTILE * len(rows)))).values
