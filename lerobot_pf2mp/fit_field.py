@@ -24,9 +24,11 @@ from tqdm import tqdm
 
 from lerobot_pf2mp.errors import explained
 from lerobot_pf2mp.loading import load_config
+from lerobot_pf2mp.policies.guided.action_kind import warn_unless_positions
 from lerobot_pf2mp.policies.guided.action_units import normalised_unit
 from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
 from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
+from lerobot_pf2mp.policies.guided.relative_actions import refuse_relative_actions
 from lerobot_pf2mp.process.atomic_files import written_beside
 
 GUIDED_TYPES = {"fmp": "pf2mp", "pf2mp": "pf2mp", "diffusion": "dppf", "dppf": "dppf"}
@@ -66,8 +68,8 @@ def fit_field(
         The new policy's configuration.
 
     Raises:
-        ValueError: If the checkpoint has another type, its actions have another shape than the dataset's, or an option
-            breaks its rule.
+        ValueError: If the checkpoint has another type, its actions are relative or have another shape than the dataset's,
+            or an option breaks its rule.
         OSError: If the checkpoint or the dataset cannot be read.
         FileExistsError: If `output_dir` exists and `overwrite` is false.
     """
@@ -82,7 +84,9 @@ def fit_field(
             policy_class = get_policy_class(guided.type)
             policy = policy_class.from_pretrained(checkpoint, config=guided, revision=checkpoint_revision)
             preprocessor, postprocessor = _load_processors(config, str(checkpoint), checkpoint_revision)
+        refuse_relative_actions(preprocessor.steps)
         dataset = _load_dataset(repo_id, root, episodes, dataset_revision)
+        warn_unless_positions(dataset, guided.field_settings.action_dims)
         step = _fitted_step(guided, dataset, preprocessor)
         preprocessor.steps = [
             *(old for old in preprocessor.steps if not isinstance(old, PotentialFieldProcessorStep)),
