@@ -34,7 +34,7 @@ LEFT_OUT = ("episode", "nothing")
 
 # The threshold of H lies this far below the quantile, absolutely and relative to it, so that actions whose density is
 # exactly the quantile lie in H however their density is rounded.
-_TIES = 1e-3, 1e-6
+_TIES = 1e-4, 1e-6
 
 _TINY = torch.finfo(torch.float32).tiny
 

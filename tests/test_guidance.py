@@ -20,7 +20,8 @@ from lerobot_pf2mp.potential_field import PotentialField, fit
 
 
 def random_field(dim: int = 2, alpha: float = 0.0, bandwidth: float = 0.2) -> PotentialField:
-    return fit(torch.randn(200, dim), bandwidth=bandwidth, threshold_quantile=0.2, alpha=alpha)
+    points = torch.randn(200, dim)
+    return fit(points, bandwidth=bandwidth, threshold_quantile=0.2, alpha=alpha, leave_out="nothing")
 
 
 def config_of(**options: Any) -> PF2MPConfig:

@@ -135,14 +135,15 @@ def test_steps_from_far_away_are_finite(far: float) -> None:
 
 def test_the_extension_refuses_arrays_that_do_not_fit() -> None:
     held = KernelTree.of(paths(300, 2), 0.05)._held
-    leaves, boxes, centre, exponent_per_square, exponent_range = held
+    leaves, boxes, centre, periods, *numbers = held
     queries, log_sums = np.zeros((5, 2), np.float32), np.zeros(5, np.float32)
     bad_trees = [
-        (leaves[1:], boxes, centre, exponent_per_square, exponent_range),
-        (leaves, boxes[:-1], centre, exponent_per_square, exponent_range),
-        (leaves, boxes[:-2], centre, exponent_per_square, exponent_range),
-        (leaves, boxes, centre[1:], exponent_per_square, exponent_range),
-        (leaves, boxes, centre[:0], exponent_per_square, exponent_range),
+        (leaves[1:], boxes, centre, periods, *numbers),
+        (leaves, boxes[:-1], centre, periods, *numbers),
+        (leaves, boxes[:-2], centre, periods, *numbers),
+        (leaves, boxes, centre[1:], periods, *numbers),
+        (leaves, boxes, centre[:0], periods, *numbers),
+        (leaves, boxes, centre, centre[1:], *numbers),
     ]
     for tree in bad_trees:
         with pytest.raises(ValueError, match="do not fit"):

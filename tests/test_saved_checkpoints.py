@@ -43,7 +43,7 @@ def test_a_checkpoint_of_before_plans_the_same_actions(policy_type: str, options
         torch.set_num_threads(n_threads)
     if made_with == {"torch": torch.__version__, "processor": processor()}:
         assert torch.equal(chunk, saved[options])
-    torch.testing.assert_close(chunk, saved[options], rtol=0, atol=1e-4)
+    torch.testing.assert_close(chunk, saved[options], rtol=0, atol=5e-4)
 
 
 @pytest.mark.parametrize("policy_type", ["pf2mp", "dppf"])

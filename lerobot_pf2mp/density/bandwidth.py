@@ -23,8 +23,8 @@ _SMALLEST_BANDWIDTH = 1e-3
 # Bandwidths whose squares and logarithms are ordinary float32 numbers.
 _BANDWIDTH_RANGE = (1e-12, 1e12)
 
-# Largest number of points that decide on the bandwidth.
-_N_JUDGED = 3000
+# Number of points that decide on the bandwidth: as many as these products of pairs and dimensions allow, within bounds.
+_WORK, _FEWEST_JUDGED, _MOST_JUDGED = 1e8, 500, 2000
 
 # Share of the points, the least likely ones, that do not count when episodes judge each other. It bounds the influence
 # of wrong values and of an episode that went where no other did.
@@ -166,14 +166,27 @@ def _most_likely_across_groups(held_out: HeldOut) -> float:
     """
     spread = _robust_spread(held_out.points, held_out.periods)
     smallest, largest = _SMALLEST_BANDWIDTH * spread, 3 * spread
-    h = spread / 4
-    for _ in range(6):
-        thinned, previous = _one_of_each_cell(held_out, _REST * h), h
-        rows = torch.linspace(0, len(thinned.points) - 1, min(_N_JUDGED, len(thinned.points))).long()
-        h = _maximise(partial(_trimmed_log_likelihood, thinned, rows), smallest, largest)
-        if abs(math.log(h / previous)) < 0.02:
+    h, low, high, n_before = spread / 4, smallest, largest, 0
+    likelihood = None
+    for _ in range(4):
+        thinned, before = _one_of_each_cell(held_out, _REST * h), h
+        if len(thinned.points) == n_before:
             break
-    return h
+        n_before = len(thinned.points)
+        likelihood = partial(_trimmed_log_likelihood, thinned, _evenly_chosen(thinned.points))
+        h = _maximise(likelihood, low, high, tolerance=0.05)
+        if abs(math.log(h / before)) < 0.02:
+            break
+        low, high = max(h / 4, smallest), 1.3 * h
+    assert likelihood is not None
+    return _maximise(likelihood, 0.9 * h, 1.1 * h, tolerance=0.005)
+
+
+def _evenly_chosen(points: Tensor) -> Tensor:
+    """``(N,)`` rows of points ``(P, D)``, evenly spaced, as many as the time allows."""
+    n_points, dim = points.shape
+    n_most = int(min(max(_WORK / (n_points * dim), _FEWEST_JUDGED), _MOST_JUDGED, n_points))
+    return torch.linspace(0, n_points - 1, n_most).long()
 
 
 def _trimmed_log_likelihood(held_out: HeldOut, rows: Tensor, bandwidth: float) -> float:
@@ -219,13 +232,15 @@ def _one_of_each_cell(held_out: HeldOut, side: float) -> HeldOut:
     return HeldOut(held_out.points[kept], groups[kept], held_out.periods)
 
 
-def _maximise(function: Callable[[float], float], smallest: float, largest: float) -> float:
-    """The argument between two positive bounds with the largest value, to 1 %, by golden-section search on its log."""
+def _maximise(
+    function: Callable[[float], float], smallest: float, largest: float, tolerance: float = 0.01
+) -> float:
+    """The argument between two positive bounds with the largest value, by golden-section search on its logarithm."""
     golden = (math.sqrt(5) - 1) / 2
     low, high = math.log(smallest), math.log(largest)
     left, right = high - golden * (high - low), low + golden * (high - low)
     at_left, at_right = function(math.exp(left)), function(math.exp(right))
-    while high - low > 0.01:
+    while high - low > tolerance:
         if at_left > at_right:
             high, right, at_right = right, left, at_left
             left = high - golden * (high - low)
