@@ -421,7 +421,7 @@ def fit_judged(
     groups = group_numbers(
         len(points), None if episodes is None else episodes.cpu(), None if times is None else times.cpu()
     )
-    held_out = HeldOut(on_cpu, groups, periods)
+    held_out = HeldOut(on_cpu, groups, periods, None if times is None else times.cpu())
     if not held_out.can_judge:  # as few as one or two points
         field = _fit_to_itself(points, periods, bandwidth, threshold_quantile, alpha)
         nothing = torch.full((len(points),), math.inf)

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import torch
-from demonstrated_paths import paths
+from demonstrated_paths import paths, some_periods, turning_paths
 from lerobot.configs import FeatureType, PolicyFeature
 from torch import Tensor
 
@@ -135,6 +135,32 @@ def test_compiled_sums_are_the_same(is_prepared: bool, sums: str) -> None:
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("is_prepared", [True, False])
+@pytest.mark.parametrize("n_angles", [1, 2])
+def test_compiled_sums_over_angles_are_the_same(n_angles: int, is_prepared: bool, sums: str) -> None:
+    periods = some_periods(2, n_angles)
+    kernel_sums = KernelSums(turning_paths(1000, periods), 0.02, periods)
+    queries = turning_paths(100, periods, seed=1)
+    wanted = KernelSums(kernel_sums.anchors, 0.02, periods)(queries)
+    if is_prepared:
+        kernel_sums(queries[:1])
+    found = torch.compile(kernel_sums.__call__, backend="eager", fullgraph=True)(queries)
+    for one, other in zip(found, wanted, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.skipif(not kernel_tree.is_available(), reason="the C extension could not be built")
+def test_compiled_steps_over_angles_are_the_same() -> None:
+    periods = some_periods(2, 1)
+    tree = KernelSums(turning_paths(1000, periods), 0.02, periods).tree
+    targets = KernelSums(turning_paths(100, periods), 0.02, periods).tree
+    queries = turning_paths(100, periods, seed=1)
+    for method, arguments in ((tree.steps_to, (0.5, 0.1)), (tree.offsets_to, ())):
+        found = torch.compile(method, backend="eager", fullgraph=True)(targets, queries, 3.0, *arguments)
+        wanted = method(targets, queries, 3.0, *arguments)
+        torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.slow
 def test_a_compiled_field_is_the_same(sums: str) -> None:
     points = paths(1000, 2)
@@ -153,9 +179,11 @@ def test_a_compiled_field_is_the_same(sums: str) -> None:
 
 
 @pytest.mark.skipif(not kernel_tree.is_available(), reason="the C extension could not be built")
-def test_the_extensions_operators_are_proper_ones() -> None:
-    parts = KernelSums(paths(300, 2), 0.05).tree._parts
-    targets = KernelSums(paths(100, 2), 0.05).tree._parts
+@pytest.mark.parametrize("n_angles", [0, 1])
+def test_the_extensions_operators_are_proper_ones(n_angles: int) -> None:
+    periods = some_periods(2, n_angles)
+    parts = KernelSums(paths(300, 2), 0.05, periods).tree._parts
+    targets = KernelSums(paths(100, 2), 0.05, periods).tree._parts
     queries = paths(50, 2, seed=1)
     torch.library.opcheck(kernel_tree._sums_operator, (*parts, queries))
     torch.library.opcheck(kernel_tree._steps_operator, (*parts, *targets, queries, 0.5, 0.3, 0.1))

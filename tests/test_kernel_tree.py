@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from demonstrated_paths import brute_force, paths
+from demonstrated_paths import brute_force, differences, paths, some_periods, turning_paths
 from harness import threads
 
 from lerobot_pf2mp.density import kernel_tree
@@ -119,6 +119,71 @@ def test_a_step_is_a_share_of_the_offset_to_the_mean_and_a_limited_one_to_a_targ
     assert 300 < (lengths > 0).sum() < 1200
 
 
+@pytest.mark.parametrize("n_anchors", [1, 64, 200, 3000])
+@pytest.mark.parametrize(("dim", "n_angles"), [(1, 0), (1, 1), (2, 1), (2, 2), (7, 1), (7, 7)])
+def test_the_offset_to_the_nearest_target_goes_the_short_way_round(
+    dim: int, n_angles: int, n_anchors: int
+) -> None:
+    periods = some_periods(dim, n_angles)
+    targets = turning_paths(n_anchors, periods)
+    queries = turning_paths(500, periods, seed=1) + 0.1 * torch.randn(500, dim)
+    offsets = differences(queries, targets, periods)
+    nearest = offsets.norm(dim=-1).argmin(dim=1)
+    tree = KernelTree.of(targets, 0.05, periods)
+    found = tree.offsets_to(tree, queries, math.inf)
+    torch.testing.assert_close(found.double(), offsets[torch.arange(500), nearest], rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_a_step_goes_the_short_way_round(share: float) -> None:
+    periods = some_periods(3, 2)
+    sums = KernelSums(turning_paths(3000, periods), 0.05, periods)
+    queries = turning_paths(1500, periods, seed=1) + 0.1 * torch.randn(1500, 3)
+    targets = KernelTree.of(sums.anchors[:300], 0.05, periods)
+    shifts = share * brute_force(queries, sums.anchors, 0.05, periods)[0].float()
+    log_sums = brute_force(queries + shifts, sums.anchors, 0.05, periods)[1]
+    log_sum = log_sums.median().item()
+    offsets = differences(queries + shifts, sums.anchors[:300], periods)
+    ways = offsets[torch.arange(1500), offsets.norm(dim=-1).argmin(dim=1)].float()
+    ways[log_sums > log_sum] = 0.0
+    wanted = shifts + ways * (0.1 / ways.norm(dim=1, keepdim=True).clamp_min(0.1))
+    found = sums.tree.steps_to(targets, queries, log_sum, share, 0.1)
+    is_clear = (log_sums - log_sum).abs() > 1e-3
+    torch.testing.assert_close(found[is_clear], wanted[is_clear], rtol=1e-4, atol=1e-4)
+
+
+def test_a_turn_costs_no_digits() -> None:
+    # Anchors a millionth apart on both sides of half a turn: the difference of a whole turn would lose 2e-7 of it.
+    half = torch.tensor(math.pi)
+    steps = torch.arange(-20, 20) * 1e-6
+    anchors = torch.where(steps < 0, half + steps, steps - half)[:, None]
+    tree = KernelTree.of(anchors, 1e-6, periods=2 * half[None])
+    found, found_sums = tree.sums(anchors)
+    wanted, wanted_sums = brute_force(anchors, anchors, 1e-6, 2 * half[None])
+    torch.testing.assert_close(found.double(), wanted, rtol=1e-4, atol=1e-11)
+    torch.testing.assert_close(found_sums.double(), wanted_sums, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("n_threads", [1, 2, 3])
+def test_threads_change_nothing_for_angles_and_groups(n_threads: int) -> None:
+    periods = some_periods(3, 1)
+    tree = KernelTree.of(turning_paths(3000, periods), 0.05, periods, torch.arange(3000) // 10)
+    queries, groups = turning_paths(2500, periods, seed=1), torch.arange(2500) // 10
+    one_by_one = zip(queries.split(100), groups.split(100), strict=True)
+    wanted = [torch.cat(x) for x in zip(*(tree.sums_without_own_group(*x) for x in one_by_one), strict=True)]
+    with threads(n_threads):
+        found = [*tree.sums(queries), *tree.sums_without_own_group(queries, groups)]
+    wanted = [*(torch.cat(x) for x in zip(*map(tree.sums, queries.split(100)), strict=True)), *wanted]
+    for one, other in zip(found, wanted, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-5)
+
+
+def test_a_tree_without_groups_leaves_none_out() -> None:
+    tree = KernelTree.of(paths(10, 2), 0.1)
+    with pytest.raises(ValueError, match="must have groups"):
+        tree.sums_without_own_group(paths(5, 2), torch.zeros(5, dtype=torch.int64))
+
+
 @pytest.mark.parametrize("far", [1e6, 3e38, torch.nan])
 def test_steps_from_far_away_are_finite(far: float) -> None:
     queries = torch.tensor([[far, 0.0], [0.0, -far], [5.0, 5.0]])
@@ -135,19 +200,24 @@ def test_steps_from_far_away_are_finite(far: float) -> None:
 
 def test_the_extension_refuses_arrays_that_do_not_fit() -> None:
     held = KernelTree.of(paths(300, 2), 0.05)._held
-    leaves, boxes, centre, periods, *numbers = held
+    leaves, boxes, centre, periods, *exponents = held
     queries, log_sums = np.zeros((5, 2), np.float32), np.zeros(5, np.float32)
     bad_trees = [
-        (leaves[1:], boxes, centre, periods, *numbers),
-        (leaves, boxes[:-1], centre, periods, *numbers),
-        (leaves, boxes[:-2], centre, periods, *numbers),
-        (leaves, boxes, centre[1:], periods, *numbers),
-        (leaves, boxes, centre[:0], periods, *numbers),
-        (leaves, boxes, centre, centre[1:], *numbers),
+        (leaves[1:], boxes, centre, periods, *exponents),
+        (leaves, boxes[:-1], centre, periods, *exponents),
+        (leaves, boxes[:-2], centre, periods, *exponents),
+        (leaves, boxes, centre[1:], periods, *exponents),
+        (leaves, boxes, centre[:0], periods, *exponents),
+        (leaves, boxes, centre, centre[1:], *exponents),
     ]
+    labels, groups = np.zeros((len(leaves), leaves.shape[2]), np.int32), np.zeros(5, np.int32)
     for tree in bad_trees:
         with pytest.raises(ValueError, match="do not fit"):
             kernel_tree._kernel_tree.sum_kernels(tree, queries, queries.copy(), log_sums, 1)
+        with pytest.raises(ValueError, match="do not fit"):
+            kernel_tree._kernel_tree.sum_other_kernels(
+                tree, labels, queries, groups, log_sums, log_sums.copy(), 1
+            )
         with pytest.raises(ValueError, match="do not fit"):
             kernel_tree._kernel_tree.lead_to_targets(held, tree, queries, 0.0, queries.copy(), 1)
         with pytest.raises(ValueError, match="do not fit"):
@@ -159,6 +229,14 @@ def test_the_extension_refuses_arrays_that_do_not_fit() -> None:
     ):
         with pytest.raises(ValueError, match="do not fit"):
             kernel_tree._kernel_tree.sum_kernels(held, queries, offsets.copy(), sums.copy(), 1)
+    for arrays in (
+        (labels[1:], queries, groups, log_sums, log_sums.copy()),
+        (labels, queries[1:], groups, log_sums, log_sums.copy()),
+        (labels, queries, groups[1:], log_sums, log_sums.copy()),
+        (labels, queries, groups, log_sums, log_sums[1:].copy()),
+    ):
+        with pytest.raises(ValueError, match="do not fit"):
+            kernel_tree._kernel_tree.sum_other_kernels(held, *arrays, 1)
     with pytest.raises(ValueError, match="do not fit"):
         kernel_tree._kernel_tree.lead_to_targets(held, held, queries, 0.0, queries[1:].copy(), 1)
     with pytest.raises(ValueError, match="do not fit"):

@@ -4,8 +4,10 @@
 Anchors lie in the leaves of a k-d tree. Queries are sorted into groups of neighbours. Each group walks down the tree
 once, nearer child first, and skips each node that is too far away to count for any of its queries. A query keeps its
 sums relative to the kernel of the nearest anchor seen so far, as attention does, so that they neither overflow nor
-vanish. Distances come from differences, not from |q|^2 - 2 q.x + |x|^2, so that single precision is enough. In an angle
-they are the short way round: its positions and queries are kept within half a period of the centre.
+vanish. Distances come from differences, not from |q|^2 - 2 q.x + |x|^2, so that single precision is enough.
+
+A dimension may be an angle. Then positions lie within half a period of zero, and so do differences: only the nearest
+image of an anchor counts. The code for angles, and that for labels of anchors, is compiled apart from the ordinary one.
 */
 
 #define _GNU_SOURCE /* RTLD_DEFAULT */
@@ -14,6 +16,7 @@ they are the short way round: its positions and queries are kept within half a p
 #include <Python.h>
 
 #include <dlfcn.h>
+#include <float.h>
 #include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
@@ -52,15 +55,18 @@ typedef int32_t LooseIntegers __attribute__((vector_size(4 * LANES), aligned(4))
    least -LARGEST. */
 static const float FARTHEST = 5e17f, LARGEST = 3e38f;
 
-/* An offset beyond this leads to a slot without an anchor. */
-static const float NO_ANCHOR = 5e18f;
+/* Squared distances are smaller than this in each dimension, and larger to slots without an anchor. */
+static const float NO_ANCHOR = 1e37f;
+
+/* Relative safety margin of bounds against rounding. */
+static const float MARGIN = 5e-7f;
 
 typedef struct {
     const float *leaves; /* (L, D, WIDTH); leaf i is node L - 1 + i */
     const float *boxes;  /* (2 L - 1, 2, D) corners; node k has the children 2 k + 1 and 2 k + 2 */
     const float *centre; /* (D,) origin of leaves and boxes */
-    const float *periods; /* (D,) of angles, 0 for other dimensions; NULL if there are no angles */
-    const int32_t *labels; /* (L, WIDTH) of the anchors; NULL if there are none */
+    const float *periods;  /* (D,) of angles, 0 for other dimensions; NULL if there are no angles */
+    const int32_t *labels; /* (L, WIDTH) of the anchors; only for the aim OTHERS */
     Py_ssize_t n_leaves, dim;
     float exponent_per_square; /* log2(e) / 2h^2: times a squared distance, it is a kernel's negative exponent of 2 */
     float exponent_range;      /* kernels smaller than the nearest anchor's by more powers of two are left out */
@@ -69,17 +75,18 @@ typedef struct {
 typedef struct {
     Py_ssize_t size;
     float *positions;  /* (G, D) relative to the centre */
-    float *low, *high; /* (D,) corners of the box around them */
+    float *low, *high; /* (D,) corners of the box around them; an angle in it may be up to a period from zero */
+    float *halves;     /* (D,) half the periods of angles, infinite for other dimensions */
+    int32_t *labels;   /* (G,) only for the aim OTHERS */
     float *nearest;    /* (G,) squared distances to the nearest anchor seen so far */
     float *offsets;    /* (G, D) to that anchor; only for the aim NEAREST */
     Lanes *sums;       /* (G, 1 + D) of kernels, and of kernels times offsets, each relative to the nearest anchor's */
     double *totals;    /* (G, 1 + D) of what left `sums` */
     int *n_leaves;     /* (G,) that `sums` holds */
-    int32_t *labels;   /* (G,) only for the aim OTHERS */
 } Group;
 
-/* The wanted result: the sums; only the nearest anchor; or the sum of the kernels, without offsets, and the nearest
-   distance, both over the anchors whose label differs from the query's by more than 1. */
+/* The wanted result: the sums, or only the nearest anchor, or the sum of kernels and the distance to the nearest anchor
+   among those whose label differs by more than 1 from the query's. */
 typedef enum { SUMS, NEAREST, OTHERS } Aim;
 
 /* ---- Sorting points into groups of neighbours -------------------------------------------------------------------- */
@@ -144,9 +151,38 @@ static void sort(const float *points, Py_ssize_t dim, int64_t *order, Py_ssize_t
     }
 }
 
+/* ---- Angles ------------------------------------------------------------------------------------------------------ */
+
+/* An angle brought within half a period of zero. It costs no digits. */
+static float wrapped(float x, float period) {
+    if (fabsf(x) <= period / 2) return x;
+    return remainderf(x < -FLT_MAX ? -FLT_MAX : x > FLT_MAX ? FLT_MAX : x, period);
+}
+
+/* x - q, for angles to the nearest image of x. `halves` are half periods, infinite for other dimensions; NULL if there
+   are no angles. Half a period is taken from each of x and q: their difference is close to a whole period where the
+   images are close to each other, so it would lose their digits. */
+INLINE float offset_to(float x, float q, const float *halves, Py_ssize_t d) {
+    const float offset = x - q;
+    if (!halves || !(fabsf(offset) > halves[d])) return offset;
+    const float half = copysignf(halves[d], offset);
+    return (x - half) - (q + half);
+}
+
 /* ---- Kernels of one query and the anchors of one leaf ------------------------------------------------------------ */
 
 INLINE Lanes load(const float *address) { return *(const LooseLanes *)address; }
+
+/* What `offset_to` returns, for the anchors from `address` on. */
+INLINE Lanes offsets_to(const float *address, float q, const float *halves, Py_ssize_t d) {
+    const Lanes x = load(address);
+    if (!halves) return x - q;
+    const Lanes offset = x - q, half = halves[d] - (Lanes){0};
+    const Integers sign = (Integers)offset & INT32_MIN, size = (Integers)offset & INT32_MAX;
+    const Integers is_wide = (Lanes)size > half;
+    const Lanes shift = (Lanes)(is_wide & ((Integers)half | sign));
+    return (x - shift) - (q + shift);
+}
 
 INLINE Lanes lower(Lanes a, Lanes b) {
     const Integers is_lower = a < b;
@@ -195,50 +231,31 @@ INLINE void move_to_totals(Group *group, Py_ssize_t i, Py_ssize_t dim) {
     group->n_leaves[i] = 0;
 }
 
-/* Offsets of at most one period, the short way round. */
-INLINE Lanes short_way(Lanes offset, float period) {
-    const Lanes turns = offset * (1.0f / period) + 12582912.0f; /* 1.5 * 2^23: the last digit is worth 1 */
-    const Lanes around = offset - period * (turns - 12582912.0f);
-    const Integers is_slot = offset > NO_ANCHOR;
-    return (Lanes)((is_slot & (Integers)offset) | (~is_slot & (Integers)around));
-}
-
-INLINE float short_way_of_one(float offset, float period) {
-    const float turns = offset * (1.0f / period) + 12582912.0f;
-    return offset - period * (turns - 12582912.0f);
-}
-
-INLINE Lanes offsets_from(
-    const Tree *tree, const float *leaf, const float *q, Py_ssize_t d, int v, const int wraps
-) {
-    const Lanes offset = load(leaf + d * WIDTH + v * LANES) - q[d];
-    return wraps && tree->periods[d] > 0.0f ? short_way(offset, tree->periods[d]) : offset;
-}
-
 INLINE void distances(
-    const Tree *tree, const float *leaf, const float *q, const Py_ssize_t dim, Lanes squares[VECTORS], const int wraps
+    const float *leaf, const float *q, const float *halves, const Py_ssize_t dim, Lanes squares[VECTORS]
 ) {
     for (int v = 0; v < VECTORS; v++) squares[v] = (Lanes){0};
     for (Py_ssize_t d = 0; d < dim; d++)
         for (int v = 0; v < VECTORS; v++) {
-            const Lanes offset = offsets_from(tree, leaf, q, d, v, wraps);
+            const Lanes offset = offsets_to(leaf + d * WIDTH + v * LANES, q[d], halves, d);
             squares[v] += offset * offset;
         }
 }
 
-/* Puts the anchors of a leaf whose label differs from the query's by at most 1 infinitely far away. */
+/* Makes the squared distances to the anchors infinite whose label differs by at most 1 from the query's. */
 INLINE void leave_out(const int32_t *labels, int32_t label, Lanes squares[VECTORS]) {
-    const Lanes zero = {0}, infinite = zero + INFINITY;
+    const float infinity = INFINITY;
+    const Integers infinite = (Integers)(infinity - (Lanes){0});
     for (int v = 0; v < VECTORS; v++) {
-        const Integers difference = *(const LooseIntegers *)(labels + v * LANES) - label;
-        const Integers is_left_out = (difference >= -1) & (difference <= 1);
-        squares[v] = (Lanes)((is_left_out & (Integers)infinite) | (~is_left_out & (Integers)squares[v]));
+        const Integers of_anchors = *(const LooseIntegers *)(labels + v * LANES);
+        const Integers is_left_out = (of_anchors >= label - 1) & (of_anchors <= label + 1);
+        squares[v] = (Lanes)((is_left_out & infinite) | (~is_left_out & (Integers)squares[v]));
     }
 }
 
 INLINE void add_kernels(
-    const Tree *tree, const float *leaf, Group *group, Py_ssize_t i, const Lanes squares[VECTORS], const Py_ssize_t dim,
-    const Aim aim, const int wraps
+    const Tree *tree, const float *leaf, Group *group, Py_ssize_t i, const Lanes squares[VECTORS],
+    const float *halves, const Py_ssize_t dim, const Aim aim
 ) {
     const float *q = group->positions + i * dim;
     Lanes *sums = group->sums + i * (1 + dim);
@@ -249,7 +266,8 @@ INLINE void add_kernels(
     }
     for (Py_ssize_t d = 0; aim == SUMS && d < dim; d++) {
         Lanes shift = sums[1 + d];
-        for (int v = 0; v < VECTORS; v++) shift += weights[v] * offsets_from(tree, leaf, q, d, v, wraps);
+        for (int v = 0; v < VECTORS; v++)
+            shift += weights[v] * offsets_to(leaf + d * WIDTH + v * LANES, q[d], halves, d);
         sums[1 + d] = shift;
     }
     if (++group->n_leaves[i] == LEAVES_IN_SINGLE) move_to_totals(group, i, dim);
@@ -264,64 +282,62 @@ INLINE void shrink(Group *group, Py_ssize_t i, float factor, const Py_ssize_t di
 
 /* Stores the offset to the anchor of this leaf that is nearest to query i. */
 INLINE void store_offset(
-    const Tree *tree, const float *leaf, Group *group, Py_ssize_t i, const Lanes squares[VECTORS], const Py_ssize_t dim,
-    const int wraps
+    const float *leaf, Group *group, Py_ssize_t i, const Lanes squares[VECTORS], const float *halves,
+    const Py_ssize_t dim
 ) {
     float flat[WIDTH];
     memcpy(flat, squares, sizeof flat);
     int slot = 0;
     while (slot < WIDTH - 1 && flat[slot] != group->nearest[i]) slot++;
-    for (Py_ssize_t d = 0; d < dim; d++) {
-        const float offset = leaf[d * WIDTH + slot] - group->positions[i * dim + d];
-        const int is_angle = wraps && tree->periods[d] > 0.0f;
-        group->offsets[i * dim + d] = is_angle ? short_way_of_one(offset, tree->periods[d]) : offset;
-    }
+    for (Py_ssize_t d = 0; d < dim; d++)
+        group->offsets[i * dim + d] = offset_to(leaf[d * WIDTH + slot], group->positions[i * dim + d], halves, d);
 }
 
 INLINE void visit_leaf(
-    const Tree *tree, const float *leaf, Py_ssize_t number, Group *group, Py_ssize_t i, const Py_ssize_t dim,
-    const Aim aim, const int wraps
+    const Tree *tree, Py_ssize_t leaf_index, Group *group, Py_ssize_t i, const float *halves, const Py_ssize_t dim,
+    const Aim aim
 ) {
+    const float *leaf = tree->leaves + leaf_index * dim * WIDTH;
     Lanes squares[VECTORS];
-    distances(tree, leaf, group->positions + i * dim, dim, squares, wraps);
-    if (aim == OTHERS) leave_out(tree->labels + number * WIDTH, group->labels[i], squares);
+    distances(leaf, group->positions + i * dim, halves, dim, squares);
+    if (aim == OTHERS) leave_out(tree->labels + leaf_index * WIDTH, group->labels[i], squares);
     Lanes least = squares[0];
     for (int v = 1; v < VECTORS; v++) least = lower(least, squares[v]);
     const float nearest = lowest(least), before = group->nearest[i];
-    if (aim == OTHERS && nearest == INFINITY) return;
+    if (aim == OTHERS && nearest >= dim * NO_ANCHOR) return;
     if (nearest < before) {
         group->nearest[i] = nearest;
         if (aim == NEAREST)
-            store_offset(tree, leaf, group, i, squares, dim, wraps);
+            store_offset(leaf, group, i, squares, halves, dim);
         else
             shrink(group, i, exp2f(tree->exponent_per_square * (nearest - before)), dim);
     }
     const int counts = !(tree->exponent_per_square * (nearest - before) > tree->exponent_range);
-    if (aim != NEAREST && counts) add_kernels(tree, leaf, group, i, squares, dim, aim, wraps);
+    if (aim != NEAREST && counts) add_kernels(tree, leaf, group, i, squares, halves, dim, aim);
 }
 
 /* ---- Walking down the tree --------------------------------------------------------------------------------------- */
 
-/* The squared distance between two boxes; in an angle, to the nearest of a box's images. */
+/* The squared distance between two boxes, or less. */
 INLINE float gap(
-    const Tree *tree, const float *low, const float *high, const float *box, const Py_ssize_t dim, const int wraps
+    const float *low, const float *high, const float *box, const float *halves, const Py_ssize_t dim
 ) {
     float square = 0.0f;
     for (Py_ssize_t d = 0; d < dim; d++) {
         const float below = box[d] - high[d], above = low[d] - box[dim + d];
         float distance = below > above ? below : above;
-        if (wraps && tree->periods[d] > 0.0f) {
-            /* Both lie within half a period of the centre. A box below has an image above, and the other way round. */
-            const float around = tree->periods[d] + (below < above ? below : above);
-            distance = around < distance ? around : distance;
+        if (halves) { /* the other way round */
+            const float other = 2.0f * (1.0f - MARGIN) * halves[d] + (below > above ? above : below);
+            distance = other < distance ? other : distance;
         }
         square += distance > 0.0f ? distance * distance : 0.0f;
     }
     return square;
 }
 
-INLINE void walk(const Tree *tree, Group *group, const Py_ssize_t dim, const Aim aim, const int wraps) {
-    const float exponent_range = aim != NEAREST ? tree->exponent_range : 0.0f;
+INLINE void walk(const Tree *tree, Group *group, const Py_ssize_t dim, const Aim aim, const int has_angles) {
+    const float exponent_range = aim == NEAREST ? 0.0f : tree->exponent_range;
+    const float *halves = has_angles ? group->halves : NULL;
     struct {
         Py_ssize_t node;
         float square;
@@ -332,8 +348,8 @@ INLINE void walk(const Tree *tree, Group *group, const Py_ssize_t dim, const Aim
         if (tree->exponent_per_square * (todo[n_todo].square - farthest) > exponent_range) continue;
         if (node < tree->n_leaves - 1) {
             Py_ssize_t near = 2 * node + 1, far = near + 1;
-            float near_square = gap(tree, group->low, group->high, tree->boxes + near * 2 * dim, dim, wraps);
-            float far_square = gap(tree, group->low, group->high, tree->boxes + far * 2 * dim, dim, wraps);
+            float near_square = gap(group->low, group->high, tree->boxes + near * 2 * dim, halves, dim);
+            float far_square = gap(group->low, group->high, tree->boxes + far * 2 * dim, halves, dim);
             if (far_square < near_square) {
                 const float square = near_square;
                 near_square = far_square, far_square = square;
@@ -343,23 +359,20 @@ INLINE void walk(const Tree *tree, Group *group, const Py_ssize_t dim, const Aim
             todo[n_todo].node = near, todo[n_todo++].square = near_square;
             continue;
         }
-        const Py_ssize_t number = node - (tree->n_leaves - 1);
-        const float *leaf = tree->leaves + number * dim * WIDTH;
+        const Py_ssize_t leaf = node - (tree->n_leaves - 1);
         const float *box = tree->boxes + node * 2 * dim;
         farthest = 0.0f;
         for (Py_ssize_t i = 0; i < group->size; i++) {
             const float *q = group->positions + i * dim;
-            const float square = gap(tree, q, q, box, dim, wraps);
-            if (!(tree->exponent_per_square * (square - group->nearest[i]) > exponent_range))
-                visit_leaf(tree, leaf, number, group, i, dim, aim, wraps);
+            if (!(tree->exponent_per_square * (gap(q, q, box, halves, dim) - group->nearest[i]) > exponent_range))
+                visit_leaf(tree, leaf, group, i, halves, dim, aim);
             farthest = group->nearest[i] > farthest ? group->nearest[i] : farthest;
         }
     }
 }
 
 FOR_EACH_PROCESSOR static void sum_up(const Tree *tree, Group *group) {
-    switch (tree->periods ? 0 : tree->dim) { /* loops of a known length are unrolled */
-    case 0: walk(tree, group, tree->dim, SUMS, 1); break;
+    switch (tree->dim) { /* loops of a known length are unrolled */
     case 1: walk(tree, group, 1, SUMS, 0); break;
     case 2: walk(tree, group, 2, SUMS, 0); break;
     case 3: walk(tree, group, 3, SUMS, 0); break;
@@ -368,41 +381,55 @@ FOR_EACH_PROCESSOR static void sum_up(const Tree *tree, Group *group) {
     }
 }
 
-FOR_EACH_PROCESSOR static void find_nearest(const Tree *tree, Group *group) {
-    if (tree->periods)
-        walk(tree, group, tree->dim, NEAREST, 1);
-    else
-        walk(tree, group, tree->dim, NEAREST, 0);
+FOR_EACH_PROCESSOR static void sum_up_with_angles(const Tree *tree, Group *group) {
+    walk(tree, group, tree->dim, SUMS, 1);
 }
 
-FOR_EACH_PROCESSOR static void sum_others(const Tree *tree, Group *group) {
-    switch (tree->periods ? 0 : tree->dim) {
-    case 0: walk(tree, group, tree->dim, OTHERS, 1); break;
-    case 2: walk(tree, group, 2, OTHERS, 0); break;
-    default: walk(tree, group, tree->dim, OTHERS, 0);
-    }
+FOR_EACH_PROCESSOR static void sum_up_others(const Tree *tree, Group *group) {
+    walk(tree, group, tree->dim, OTHERS, 0);
+}
+
+FOR_EACH_PROCESSOR static void sum_up_others_with_angles(const Tree *tree, Group *group) {
+    walk(tree, group, tree->dim, OTHERS, 1);
+}
+
+FOR_EACH_PROCESSOR static void find_nearest(const Tree *tree, Group *group) {
+    walk(tree, group, tree->dim, NEAREST, 0);
+}
+
+FOR_EACH_PROCESSOR static void find_nearest_with_angles(const Tree *tree, Group *group) {
+    walk(tree, group, tree->dim, NEAREST, 1);
 }
 
 /* ---- Groups of queries ------------------------------------------------------------------------------------------- */
 
-static void gather(
-    Group *group, const Tree *tree, const float *queries, const int32_t *labels, const int64_t *order, Py_ssize_t size
-) {
+/* Extends the group's box by query i. Angles count from the first query on, so that a box across half a period from
+   zero is as small as elsewhere. */
+static void extend_box(Group *group, const float *periods, Py_ssize_t i, Py_ssize_t dim) {
+    for (Py_ssize_t d = 0; d < dim; d++) {
+        float x = group->positions[i * dim + d];
+        if (periods && periods[d] > 0.0f) {
+            const float from_first = x - group->positions[d], period = periods[d] * (1.0f + MARGIN);
+            x = from_first > periods[d] / 2 ? x - period : from_first < -periods[d] / 2 ? x + period : x;
+        }
+        group->low[d] = x < group->low[d] ? x : group->low[d];
+        group->high[d] = x > group->high[d] ? x : group->high[d];
+    }
+}
+
+static void gather(Group *group, const Tree *tree, const float *queries, const int64_t *order, Py_ssize_t size) {
     const Py_ssize_t dim = tree->dim;
     group->size = size;
     for (Py_ssize_t d = 0; d < dim; d++) group->low[d] = INFINITY, group->high[d] = -INFINITY;
     for (Py_ssize_t i = 0; i < size; i++) {
         for (Py_ssize_t d = 0; d < dim; d++) {
             float x = queries[order[i] * dim + d] - tree->centre[d];
-            if (tree->periods && tree->periods[d] > 0.0f) x = remainderf(x, tree->periods[d]);
-            const float clamped = x < -FARTHEST ? -FARTHEST : x > FARTHEST ? FARTHEST : x;
-            group->positions[i * dim + d] = clamped;
-            group->low[d] = clamped < group->low[d] ? clamped : group->low[d];
-            group->high[d] = clamped > group->high[d] ? clamped : group->high[d];
+            if (tree->periods && tree->periods[d] > 0.0f) x = wrapped(x, tree->periods[d]);
+            group->positions[i * dim + d] = x < -FARTHEST ? -FARTHEST : x > FARTHEST ? FARTHEST : x;
         }
+        extend_box(group, tree->periods, i, dim);
         group->nearest[i] = INFINITY;
         group->n_leaves[i] = 0;
-        if (labels) group->labels[i] = labels[order[i]];
     }
     memset(group->offsets, 0, size * dim * sizeof *group->offsets);
     memset(group->sums, 0, size * (1 + dim) * sizeof *group->sums);
@@ -421,13 +448,12 @@ static void scatter_sums(Group *group, const Tree *tree, const int64_t *order, f
     }
 }
 
-static void scatter_others(Group *group, const Tree *tree, const int64_t *order, float *log_sums, float *squares) {
+/* The log sums and distances of the aim OTHERS. */
+static void scatter_others(Group *group, const Tree *tree, const int64_t *order, float *distances, float *log_sums) {
+    scatter_sums(group, tree, order, NULL, log_sums);
     for (Py_ssize_t i = 0; i < group->size; i++) {
-        move_to_totals(group, i, tree->dim);
-        const double total = group->totals[i * (1 + tree->dim)];
-        const double exponent = M_LN2 * tree->exponent_per_square * (double)group->nearest[i];
-        log_sums[order[i]] = total > 0.0 ? (float)(log(total) - exponent) : -INFINITY;
-        squares[order[i]] = group->nearest[i];
+        distances[order[i]] = isnan(log_sums[order[i]]) ? NAN : sqrtf(group->nearest[i]);
+        if (distances[order[i]] == INFINITY) log_sums[order[i]] = -INFINITY; /* no anchor remains */
     }
 }
 
@@ -437,48 +463,59 @@ static void scatter_offsets(const Group *group, Py_ssize_t dim, const int64_t *o
 }
 
 /* A computation for n of the queries. `order` holds their indices and is reordered. The result is log sums, and unless
-   `offsets` is NULL the offsets to the local means. If `log_sums` is NULL, it is the offsets to the nearest anchor. With
-   `labels` it is the log sums and the squared nearest distances over the anchors with other labels. */
+   `offsets` is NULL the offsets to the local means. If `log_sums` is NULL, it is the offsets to the nearest anchor. If
+   `distances` is not NULL, it is log sums and the distances to the nearest anchor, both without the anchors of the
+   queries' own labels. */
 typedef struct {
     const Tree *tree;
     const float *queries;
     const int32_t *labels;
     int64_t *order;
     Py_ssize_t n;
-    float *offsets, *log_sums, *squares;
+    float *offsets, *log_sums, *distances;
     Py_ssize_t n_slices, next_slice; /* each thread takes the next slice when it has finished one */
     int has_memory;
 } Job;
+
+static void do_group(const Job *job, Group *group, const int64_t *order) {
+    const Tree *tree = job->tree;
+    if (job->distances) {
+        for (Py_ssize_t i = 0; i < group->size; i++) group->labels[i] = job->labels[order[i]];
+        (tree->periods ? sum_up_others_with_angles : sum_up_others)(tree, group);
+        scatter_others(group, tree, order, job->distances, job->log_sums);
+    } else if (job->log_sums) {
+        (tree->periods ? sum_up_with_angles : sum_up)(tree, group);
+        scatter_sums(group, tree, order, job->offsets, job->log_sums);
+    } else {
+        (tree->periods ? find_nearest_with_angles : find_nearest)(tree, group);
+        scatter_offsets(group, tree->dim, order, job->offsets);
+    }
+}
 
 static int do_slice(const Job *job, int64_t *order, Py_ssize_t n) {
     const Tree *tree = job->tree;
     const Py_ssize_t dim = tree->dim, row = GROUP * (1 + dim);
     Lanes *sums = aligned_alloc(sizeof(Lanes), row * sizeof(Lanes));
     double *totals = malloc(row * sizeof *totals);
-    float *floats = malloc((2 * GROUP * dim + 2 * dim + GROUP) * sizeof *floats);
+    float *floats = malloc((2 * GROUP * dim + 3 * dim + GROUP) * sizeof *floats);
     int n_in_sums[GROUP];
     int32_t labels[GROUP];
     const int has_memory = sums && totals && floats;
     if (has_memory) {
-        Group group = {.sums = sums, .totals = totals, .n_leaves = n_in_sums, .labels = labels};
-        group.positions = floats;
+        Group group = {
+            .sums = sums, .totals = totals, .n_leaves = n_in_sums, .labels = labels, .positions = floats
+        };
         group.offsets = group.positions + GROUP * dim;
         group.low = group.offsets + GROUP * dim;
         group.high = group.low + dim;
-        group.nearest = group.high + dim;
+        group.halves = group.high + dim;
+        group.nearest = group.halves + dim;
+        for (Py_ssize_t d = 0; tree->periods && d < dim; d++)
+            group.halves[d] = tree->periods[d] > 0.0f ? tree->periods[d] / 2 : INFINITY;
         sort(job->queries, dim, order, n, GROUP);
         for (Py_ssize_t i = 0; i < n; i += GROUP) {
-            gather(&group, tree, job->queries, job->labels, order + i, n - i < GROUP ? n - i : GROUP);
-            if (job->labels) {
-                sum_others(tree, &group);
-                scatter_others(&group, tree, order + i, job->log_sums, job->squares);
-            } else if (job->log_sums) {
-                sum_up(tree, &group);
-                scatter_sums(&group, tree, order + i, job->offsets, job->log_sums);
-            } else {
-                find_nearest(tree, &group);
-                scatter_offsets(&group, dim, order + i, job->offsets);
-            }
+            gather(&group, tree, job->queries, order + i, n - i < GROUP ? n - i : GROUP);
+            do_group(job, &group, order + i);
         }
     }
     free(sums), free(totals), free(floats);
@@ -537,6 +574,19 @@ static int sum_all(
     return has_memory;
 }
 
+static int sum_all_others(
+    const Tree *tree, const float *queries, const int32_t *labels, Py_ssize_t n, float *log_sums, float *distances,
+    int n_threads
+) {
+    Job job = {
+        .tree = tree, .queries = queries, .labels = labels, .order = indices(n), .n = n, .log_sums = log_sums,
+        .distances = distances,
+    };
+    const int has_memory = job.order && do_job(&job, n_threads);
+    free(job.order);
+    return has_memory;
+}
+
 /* Keeps those of n indices whose value is not above the threshold; returns their number. */
 static Py_ssize_t keep_low(int64_t *order, Py_ssize_t n, const float *values, float threshold) {
     Py_ssize_t n_kept = 0;
@@ -587,7 +637,8 @@ static int step_all_to_targets(
                 steps[d] *= share;
                 shifted[d] = queries[d] + steps[d];
             }
-            /* A mean shift raises the log density by at least this (Comaniciu and Meer 2002, Theorem 1). */
+            /* A mean shift raises the log density by at least this (Comaniciu and Meer 2002, Theorem 1). With angles
+               this holds for the images that were nearest before; other ones raise it further. */
             log_sums[i] = (float)(log_sums[i] + gain * square);
         }
         has_memory = lead_all_to_targets(tree, targets, shifted, n, log_sums, threshold, offsets, n_threads);
@@ -614,7 +665,8 @@ typedef struct {
 
 #define HELD_TREE "(y*y*y*y*ff)"
 #define POINTERS_TO(held) \
-    &(held).leaves, &(held).boxes, &(held).centre, &(held).periods, &(held).exponent_per_square, &(held).exponent_range
+    &(held).leaves, &(held).boxes, &(held).centre, &(held).periods, &(held).exponent_per_square, \
+        &(held).exponent_range
 
 static void release(HeldTree *held) {
     PyBuffer_Release(&held->leaves), PyBuffer_Release(&held->boxes);
@@ -628,8 +680,7 @@ static int read_tree(const HeldTree *held, Tree *tree) {
     const Py_ssize_t dim = n_floats(&held->centre), n_nodes = dim ? n_floats(&held->boxes) / (2 * dim) : 0;
     *tree = (Tree){
         .leaves = held->leaves.buf, .boxes = held->boxes.buf, .centre = held->centre.buf,
-        .periods = held->periods.len ? held->periods.buf : NULL,
-        .n_leaves = (n_nodes + 1) / 2, .dim = dim,
+        .periods = held->periods.len ? held->periods.buf : NULL, .n_leaves = (n_nodes + 1) / 2, .dim = dim,
         .exponent_per_square = held->exponent_per_square, .exponent_range = held->exponent_range,
     };
     return n_nodes % 2 && n_floats(&held->boxes) == n_nodes * 2 * dim
@@ -685,28 +736,29 @@ static PyObject *sum_kernels(PyObject *module, PyObject *args) {
 
 static PyObject *sum_other_kernels(PyObject *module, PyObject *args) {
     HeldTree held;
-    Py_buffer labels, queries, query_labels, log_sums, squares;
-    int n_threads, has_memory = 1;
+    Py_buffer labels, queries, query_labels, log_sums, distances;
+    int n_threads;
     Tree tree;
     if (!PyArg_ParseTuple(
-            args, HELD_TREE "y*y*y*w*w*i", POINTERS_TO(held), &labels, &queries, &query_labels, &log_sums, &squares,
-            &n_threads
+            args, HELD_TREE "y*y*y*w*w*i", POINTERS_TO(held), &labels, &queries, &query_labels, &log_sums,
+            &distances, &n_threads
         ))
         return NULL;
     const Py_ssize_t n = n_floats(&log_sums);
-    const int fits = read_tree(&held, &tree) && n_floats(&queries) == n * tree.dim && squares.len == log_sums.len
-        && n_floats(&query_labels) == n && n_floats(&labels) == tree.n_leaves * WIDTH;
+    const int fits = read_tree(&held, &tree) && labels.len == tree.n_leaves * WIDTH * (Py_ssize_t)sizeof(int32_t)
+        && n_floats(&queries) == n * tree.dim && query_labels.len == n * (Py_ssize_t)sizeof(int32_t)
+        && distances.len == log_sums.len;
+    int has_memory = 1;
     if (fits) {
         Py_BEGIN_ALLOW_THREADS;
         tree.labels = labels.buf;
-        Job job = {.tree = &tree, .queries = queries.buf, .labels = query_labels.buf, .order = indices(n), .n = n};
-        job.log_sums = log_sums.buf, job.squares = squares.buf;
-        has_memory = job.order && do_job(&job, n_threads);
-        free(job.order);
+        has_memory = sum_all_others(
+            &tree, queries.buf, query_labels.buf, n, log_sums.buf, distances.buf, n_threads
+        );
         Py_END_ALLOW_THREADS;
     }
     release(&held), PyBuffer_Release(&labels), PyBuffer_Release(&queries), PyBuffer_Release(&query_labels);
-    PyBuffer_Release(&log_sums), PyBuffer_Release(&squares);
+    PyBuffer_Release(&log_sums), PyBuffer_Release(&distances);
     return answer(fits, has_memory);
 }
 
@@ -778,7 +830,7 @@ static PyObject *step_to_targets(PyObject *module, PyObject *args) {
 static PyMethodDef methods[] = {
     {"order_points", order_points, METH_VARARGS, "Sorts points into leaves."},
     {"sum_kernels", sum_kernels, METH_VARARGS, "The offsets to local means, and the logarithms of the sums."},
-    {"sum_other_kernels", sum_other_kernels, METH_VARARGS, "Log sums and nearest distances over other labels."},
+    {"sum_other_kernels", sum_other_kernels, METH_VARARGS, "The same without some anchors, and distances."},
     {"lead_to_targets", lead_to_targets, METH_VARARGS, "The offsets to the nearest target where the log sum is low."},
     {"step_to_targets", step_to_targets, METH_VARARGS, "The steps to local means and, at a low log sum, to targets."},
     {NULL, NULL, 0, NULL},

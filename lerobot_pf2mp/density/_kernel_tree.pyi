@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The C extension. All arrays are float32 and contiguous unless stated otherwise. It releases the GIL while it works.
 
-A tree is what `KernelTree` holds: (leaves, boxes, centre, periods, exponent_per_square, exponent_range); periods are
-empty if there are no angles. A ValueError is raised if the sizes of the arrays do not fit.
+A tree is what `KernelTree` holds: (leaves, boxes, centre, periods, exponent_per_square, exponent_range). `periods` is empty
+if no dimension is an angle. A ValueError is raised if the sizes of the arrays do not fit.
 """
 
 from numpy.typing import NDArray
@@ -23,13 +23,12 @@ def sum_other_kernels(
     queries: NDArray,
     query_labels: NDArray,
     log_sums: NDArray,
-    squares: NDArray,
+    distances: NDArray,
     n_threads: int,
 ) -> None:
-    """Fills `log_sums` ``(Q,)`` of the kernels, and `squares` ``(Q,)`` of the nearest distances, over some anchors.
+    """Fills `log_sums` ``(Q,)`` and `distances` ``(Q,)`` to the nearest anchor, both without some of the anchors.
 
-    These are the anchors whose label, of `labels` ``(L, LEAF_SIZE)`` int32, differs from the query's, of `query_labels`
-    ``(Q,)`` int32, by more than 1. Without such an anchor they are -inf and inf.
+    Left out are those whose label, one of int32 ``(L, LEAF_SIZE)``, differs by at most 1 from the query's, one of ``(Q,)``.
     """
 
 def lead_to_targets(

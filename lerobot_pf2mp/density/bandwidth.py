@@ -11,7 +11,7 @@ from numbers import Real
 import torch
 from torch import Tensor
 
-from lerobot_pf2mp.density.held_out import HeldOut
+from lerobot_pf2mp.density.held_out import HeldOut, robust_spread
 from lerobot_pf2mp.density.kernels import PAIRS_PER_BLOCK, log_kernels, log_sum_exp, mean
 
 BANDWIDTH_RULES = ("scott", "silverman", "likelihood")
@@ -26,8 +26,9 @@ _BANDWIDTH_RANGE = (1e-12, 1e12)
 # Number of points that decide on the bandwidth: as many as these products of pairs and dimensions allow, within bounds.
 _WORK, _FEWEST_JUDGED, _MOST_JUDGED = 1e8, 500, 2000
 
-# Share of the points, the least likely ones, that do not count when episodes judge each other. It bounds the influence
-# of wrong values and of an episode that went where no other did.
+# Share of the points that do not count when episodes judge each other: of the least likely ones, which bounds the
+# influence of wrong values and of an episode that went where no other did, and of the likeliest ones, which bounds that
+# of a place where all episodes rest.
 _LEFT_OUT_SHARE = 0.05
 
 # Of one episode's points that are this many bandwidths apart or less, one counts.
@@ -160,11 +161,11 @@ def _most_likely_bandwidth(points: Tensor, smallest: float, largest: float, n_po
 def _most_likely_across_groups(held_out: HeldOut) -> float:
     """The bandwidth with the largest mean log density of points, each judged by other episodes.
 
-    The least likely `_LEFT_OUT_SHARE` of the points do not count. Points of an episode within a cell of `_REST` h count
+    The least likely and the likeliest `_LEFT_OUT_SHARE` of the points do not count. Points of an episode within a cell of `_REST` h count
     once: a robot that stands still says nothing new, however long it does so and however its sensors tremble. The cells
     need h, so h is found by iteration, from above.
     """
-    spread = _robust_spread(held_out.points, held_out.periods)
+    spread = robust_spread(held_out.points, held_out.periods)
     smallest, largest = _SMALLEST_BANDWIDTH * spread, 3 * spread
     h, low, high, n_before = spread / 4, smallest, largest, 0
     likelihood = None
@@ -190,26 +191,11 @@ def _evenly_chosen(points: Tensor) -> Tensor:
 
 
 def _trimmed_log_likelihood(held_out: HeldOut, rows: Tensor, bandwidth: float) -> float:
-    """The mean log density of the likelier of some rows, each judged by other groups [nats]."""
+    """The mean log density of some rows, each judged by other groups, without the extreme ones [nats]."""
     log_density = held_out.judge(bandwidth, held_out.points[rows], held_out.groups[rows]).log_density
     known = log_density[log_density > -math.inf].double().sort().values
-    n_left_out = min(math.ceil(_LEFT_OUT_SHARE * len(known)), len(known) - 1)
-    return known[n_left_out:].mean().item()
-
-
-def _robust_spread(points: Tensor, periods: Tensor | None) -> float:
-    """The root mean square over dimensions of half the range between the 5 % and 95 % quantiles [normalised].
-
-    Dimensions in which that range is zero do not count. If it is zero in all, it is the standard deviation instead.
-    """
-    ordered = points.double().sort(dim=0).values
-    low, high = (ordered[round(share * (len(points) - 1))] for share in (0.05, 0.95))
-    halves = (high - low) / 2
-    if periods is not None:
-        halves = torch.where(periods > 0, halves.minimum(periods / 4), halves)
-    if not bool((halves > 0).any()):
-        halves = points.double().std(dim=0, correction=0)
-    return halves[halves > 0].square().mean().sqrt().item()
+    n_left_out = min(math.ceil(_LEFT_OUT_SHARE * len(known)), (len(known) - 1) // 2)
+    return known[n_left_out : len(known) - n_left_out].mean().item()
 
 
 def _one_of_each_cell(held_out: HeldOut, side: float) -> HeldOut:
@@ -220,7 +206,8 @@ def _one_of_each_cell(held_out: HeldOut, side: float) -> HeldOut:
     """
     groups = held_out.groups
     order = held_out.points[:, 0].argsort(stable=True)
-    cells = torch.floor(held_out.points[order].double() / side)
+    # Off centre, so that a rest at 0 does not lie on the border of cells.
+    cells = torch.floor(held_out.points[order].double() / side + 0.3)
     key = torch.zeros_like(order) if held_out.is_one_recording else groups[order].clone()
     for coordinate in cells.unbind(1):
         key = key * 0x5851F42D4C957F2D + coordinate.clamp(-(2.0**62), 2.0**62).long()

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from lerobot_pf2mp.density.kernel_sums import KernelSums
-from lerobot_pf2mp.density.kernels import log_kernels
+from lerobot_pf2mp.density.kernels import log_kernels, wrap
 
 # A recording without episodes is cut into this many blocks of time. With its two neighbours a block is 3 % of the
 # recording: longer than noise and a rest last, short enough for the path before and after it to vouch for a frame.
@@ -28,6 +28,13 @@ _USUAL_QUANTILE = 0.9
 
 # Points beyond a gap in one coordinate are far from all others if they are at most this share of all points.
 _LARGEST_SHARE_BEYOND_GAP = 0.02
+
+# A frame leads to the next one at most at this multiple of the speed that 95 % of the frames stay below.
+_FASTEST = 3.0
+_USUAL_SPEED_QUANTILE = 0.95
+
+# Points are clamped to this many spreads around the median: float32 would not resolve the others beside a farther one.
+_FARTHEST = 1e4
 
 _PAIRS_AT_ONCE = 2**22
 
@@ -66,6 +73,22 @@ def group_numbers(n_points: int, episodes: Tensor | None, times: Tensor | None =
     return (times - first) * N_BLOCKS // (times.max() - first + 1)
 
 
+def robust_spread(points: Tensor, periods: Tensor | None) -> float:
+    """The spread of points ``(P, D)`` that few of them cannot change [normalised]; 0 if all are equal.
+
+    It is the root mean square, over the dimensions that vary, of half the range between the 5 % and 95 % quantiles. If
+    that range is zero in all dimensions, it is that of the standard deviations.
+    """
+    ordered = points.double().sort(dim=0).values
+    low, high = (ordered[round(share * (len(points) - 1))] for share in (0.05, 0.95))
+    halves = (high - low) / 2
+    if periods is not None:
+        halves = torch.where(periods > 0, halves.minimum(periods / 4), halves)
+    if not bool((halves > 0).any()):
+        halves = points.double().std(dim=0, correction=0)
+    return halves[halves > 0].square().mean().sqrt().item() if bool((halves > 0).any()) else 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class HeldOut:
     """Judges points by those of other groups.
@@ -74,11 +97,20 @@ class HeldOut:
         points: ``(P, D)`` float32 points on the CPU [normalised].
         groups: ``(P,)`` their group numbers, see `group_numbers`.
         periods: ``(D,)`` periods of angles [normalised], 0 for other dimensions; None if there are no angles.
+        times: ``(P,)`` int64 positions in time, see `group_numbers`; None for the order of the points.
     """
 
     points: Tensor
     groups: Tensor
     periods: Tensor | None = None
+    times: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        median = self.points.median(dim=0).values
+        limit = _FARTHEST * robust_spread(self.points, self.periods)
+        if limit > 0 and bool(((self.points - median).abs() > limit).any()):
+            clamped = self.points.clamp(median - limit, median + limit)
+            object.__setattr__(self, "points", clamped)
 
     def judge(self, bandwidth: float, queries: Tensor | None = None, groups: Tensor | None = None) -> Judgement:
         """The judgement over some points.
@@ -110,8 +142,9 @@ class HeldOut:
 
         Far means `_FAR` times the distance that 90 % of the points have to the nearest point of another episode, and
         `_FAR` bandwidths. A path on which no other episode went is not outlying: its frames lead there step by step. So
-        what a chain of such steps joins to the other points is kept. A few points beyond a gap of that size in one
-        coordinate, the saturated values of a sensor for example, are outlying also where they are near one another.
+        what is joined to the other points is kept, by points that are not far, or by successive frames at the speed of
+        the recordings. A few points beyond a gap of that size in one coordinate, the saturated values of a sensor for
+        example, are outlying also where they are near one another.
 
         Args:
             distance: ``(P,)`` distance of each point to the nearest point of another episode [normalised].
@@ -127,8 +160,7 @@ class HeldOut:
         limit = _FAR * max(usual, bandwidth)
         is_beyond = self._is_beyond_gap(limit)
         is_far = is_beyond | (distance > limit) & distance.isfinite()
-        is_far[is_far.clone()] = ~self._is_joined(self.points[is_far], self.points[~is_far], limit)
-        return is_far
+        return is_far & ~self._joined_to(~is_far, limit) if bool(is_far.any()) else is_far
 
     def _is_beyond_gap(self, limit: float) -> Tensor:
         """Whether a gap wider than `limit` in one coordinate separates a point, with few others, from the rest."""
@@ -150,15 +182,43 @@ class HeldOut:
                 is_beyond[order[n_points - n_most + high[0] :]] = True
         return is_beyond
 
-    def _is_joined(self, far: Tensor, others: Tensor, limit: float) -> Tensor:
-        """Whether steps of at most `limit` lead from each far point to the others, ``(F,)``."""
-        is_joined = self._has_neighbour(far, others, limit)
-        newly = is_joined
-        while newly.any():
+    def _joined_to(self, is_start: Tensor, limit: float) -> Tensor:
+        """The points to which steps lead from some start points: of at most `limit`, or from frame to frame, ``(P,)``."""
+        is_joined, newly = is_start, is_start
+        before, leads = self._frames_before()
+        while bool(newly.any()):
             reached = torch.zeros_like(is_joined)
-            reached[~is_joined] = self._has_neighbour(far[~is_joined], far[newly], limit)
-            newly, is_joined = reached, is_joined | reached
+            reached[leads] = is_joined[before[leads]]
+            reached[before[leads]] |= is_joined[leads]
+            far = ~is_joined
+            reached[far] |= self._has_neighbour(self.points[far], self.points[newly], limit)
+            newly, is_joined = reached & far, is_joined | reached
         return is_joined
+
+    def _frames_before(self) -> tuple[Tensor, Tensor]:
+        """``(P,)`` the row of the frame before each point in its episode, and ``(L,)`` rows to which that frame leads.
+
+        It leads there at most at `_FASTEST` times the usual speed, and in a step of at most the points' spread: farther
+        apart, the frames between them are not known.
+        """
+        times = torch.arange(len(self.points)) if self.times is None else self.times
+        episode = torch.zeros_like(self.groups) if self.is_one_recording else self.groups
+        order = times.argsort(stable=True)
+        order = order[episode[order].argsort(stable=True)]
+        before = torch.arange(len(order))
+        before[order[1:]] = order[:-1]
+        rows = order[1:][episode[order[1:]] == episode[order[:-1]]]
+        if not len(rows):
+            return before, rows
+        offsets = self.points[rows] - self.points[before[rows]]
+        if self.periods is not None:
+            offsets = wrap(offsets, self.periods)
+        steps = offsets.double().norm(dim=1)
+        durations = (times[rows] - times[before[rows]]).clamp_min(1).double()
+        speeds = steps / durations
+        usual = speeds.kthvalue(max(1, math.ceil(_USUAL_SPEED_QUANTILE * len(rows)))).values
+        largest_step = robust_spread(self.points, self.periods)
+        return before, rows[(speeds <= _FASTEST * usual) & (steps <= largest_step)]
 
     def _has_neighbour(self, points: Tensor, others: Tensor, limit: float) -> Tensor:
         if not len(points) or not len(others):

@@ -4,23 +4,31 @@
 There are three implementations with equal results:
 - on a CPU a search in a tree of the anchors (kernel_tree.py);
 - on a CPU one attention call, where the C extension could not be built, or in a compiled graph if there is no tree yet;
-- on other devices softmax and sum, block by block.
+- on other devices, and for angles, softmax and sum, block by block.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
-
-import math
 
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
 from lerobot_pf2mp.density import kernel_tree
-from lerobot_pf2mp.density.kernel_tree import KernelTree, labels_in_leaves
-from lerobot_pf2mp.density.kernels import PAIRS_PER_BLOCK, log_kernels, log_sum_exp, mean, wrap
+from lerobot_pf2mp.density.kernel_tree import KernelTree
+from lerobot_pf2mp.density.kernels import (
+    PAIRS_PER_BLOCK,
+    checked_periods,
+    differences,
+    log_kernels,
+    log_sum_exp,
+    mean,
+    offsets_between,
+    without_angles,
+)
 
 # Queries and anchors are clamped to this many bandwidths, because larger squares would overflow.
 _FARTHEST = 5e17
@@ -36,9 +44,13 @@ class KernelSums:
     Args:
         anchors: ``(M, D)`` float32 positions of the kernels, M >= 1.
         bandwidth: Standard deviation h > 0 of the kernels.
-        periods: ``(D,)`` float32 periods of angles, 0 for other dimensions; None if there are no angles. In an angle,
-            differences between anchors and queries are the short way round.
-        groups: ``(M,)`` int64 group numbers of the anchors, each below 2^31; None if there are no groups.
+        periods: ``(D,)`` the period P > 0 of each dimension that is an angle, so that x and x + P are the same; 0 for the
+            other dimensions. All differences x_i - q below lie in [-P/2, P/2]. None stands for zeros.
+        groups: ``(M,)`` int64 group numbers of the anchors, for `sums_without_own_group`.
+
+    Raises:
+        ValueError: If the periods are not D finite numbers of at least 0, or the groups not M numbers that fit into
+            32 bits.
     """
 
     anchors: Tensor
@@ -46,29 +58,10 @@ class KernelSums:
     periods: Tensor | None = None
     groups: Tensor | None = None
 
-    def sums_without_own_group(self, queries: Tensor, groups: Tensor) -> tuple[Tensor, Tensor]:
-        """The log sums and the nearest distances over the anchors whose group number differs from the query's by over 1.
-
-        Args:
-            queries: ``(Q, D)`` float32 on the anchors' device.
-            groups: ``(Q,)`` int64 their group numbers.
-
-        Returns:
-            ``(Q,)`` log sums, and ``(Q,)`` distances to the nearest of these anchors; -inf and inf where there is none.
-        """
-        assert self.groups is not None
-        if self.has_tree:
-            return self.tree.sums_of_others(self._labels, queries, groups.int())
-        log_sums, distances = queries.new_empty(len(queries)), queries.new_empty(len(queries))
-        n_at_once = max(1, PAIRS_PER_BLOCK // len(self.anchors))
-        for some, group, log_sum, distance in zip(
-            *(x.split(n_at_once) for x in (queries, groups, log_sums, distances)), strict=True
-        ):
-            exponents = log_kernels(some - self._centre, self._centred, self.bandwidth, self.periods)
-            exponents[(group.unsqueeze(1) - self.groups).abs() <= 1] = -math.inf
-            log_sum.copy_(torch.logsumexp(exponents, dim=1))
-            distance.copy_((-2 * exponents.amax(dim=1)).sqrt() * self.bandwidth)
-        return log_sums, distances
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "periods", checked_periods(self.periods, self.anchors.shape[1]))
+        if self.groups is not None:
+            kernel_tree.check_groups(self.groups, len(self.anchors))
 
     def __call__(self, queries: Tensor) -> tuple[Tensor, Tensor]:
         """The offsets to the local means, and the log sums, at queries. They are finite everywhere. Memory is O(M + Q).
@@ -77,7 +70,7 @@ class KernelSums:
             queries: ``(Q, D)`` float32 on the anchors' device.
 
         Returns:
-            ``(Q, D)`` the offsets m(q) - q to the local means m(q) = sum_i w_i x_i with w = softmax_i(-|q - x_i|^2 / 2h^2);
+            ``(Q, D)`` the offsets sum_i w_i (x_i - q) to the local means, with w = softmax_i(-|q - x_i|^2 / 2h^2);
             ``(Q,)`` the log sums log sum_i exp(-|q - x_i|^2 / 2h^2).
         """
         if not len(queries):
@@ -87,8 +80,43 @@ class KernelSums:
         # Autocast would multiply in bfloat16.
         with torch.autocast(device_type=queries.device.type, enabled=False):
             centred = queries - self._centre
-            by_attention = queries.device.type == "cpu" and self.periods is None
-            return (self._by_attention if by_attention else self._from_differences)(centred)
+            is_attention = queries.device.type == "cpu" and self.periods is None
+            return (self._by_attention if is_attention else self._from_differences)(centred)
+
+    def sums_without_own_group(self, queries: Tensor, groups: Tensor) -> tuple[Tensor, Tensor]:
+        """Judges queries by the anchors of other groups. It cannot be compiled.
+
+        The anchors whose group number differs by at most 1 from a query's are left out for it.
+
+        Args:
+            queries: ``(Q, D)`` float32 on the anchors' device.
+            groups: ``(Q,)`` int64 group numbers of the queries.
+
+        Returns:
+            ``(Q,)`` the log sums of the kernels of the other anchors, -inf if there is none;
+            ``(Q,)`` the distances to the nearest other anchor [normalised], inf if there is none.
+
+        Raises:
+            ValueError: If the anchors have no groups, or the groups are not Q numbers that fit into 32 bits.
+        """
+        if self.groups is None:
+            raise ValueError("the anchors must have groups, got None")
+        kernel_tree.check_groups(groups, len(queries))
+        if self.has_tree:
+            return self.tree.sums_without_own_group(queries, groups)
+        log_sums, distances = queries.new_empty(len(queries)), queries.new_empty(len(queries))
+        n_at_once = max(1, PAIRS_PER_BLOCK // len(self.anchors))
+        for some, own, log_sum, distance in zip(
+            *(x.split(n_at_once) for x in (queries - self._centre, groups, log_sums, distances)), strict=True
+        ):
+            exponents = log_kernels(some, self._centred, self.bandwidth, self.periods)  # (Q, M)
+            exponents.masked_fill_((self.groups - own.unsqueeze(1)).abs() <= 1, -math.inf)
+            largest, nearest = exponents.max(dim=-1)
+            is_alone = largest == -math.inf
+            log_sum.copy_(log_sum_exp(exponents).masked_fill_(is_alone, -math.inf))
+            offsets = offsets_between(some, self._centred[nearest], self.periods)
+            distance.copy_(offsets.norm(dim=-1).masked_fill_(is_alone, math.inf))
+        return log_sums, distances
 
     @property
     def has_tree(self) -> bool:
@@ -99,12 +127,7 @@ class KernelSums:
     @cached_property
     def tree(self) -> KernelTree:
         """The tree of the anchors; only valid if `has_tree`."""
-        return KernelTree.of(self.anchors, self.bandwidth, self.periods)
-
-    @cached_property
-    def _labels(self) -> Tensor:
-        assert self.groups is not None
-        return labels_in_leaves(self.groups, self.anchors, self.periods)
+        return KernelTree.of(self.anchors, self.bandwidth, self.periods, self.groups)
 
     def _from_differences(self, queries: Tensor) -> tuple[Tensor, Tensor]:
         offsets, log_sums = torch.empty_like(queries), torch.empty_like(queries[:, 0])
@@ -117,9 +140,8 @@ class KernelSums:
             if self.periods is None:
                 offset.copy_(weights @ self._centred - some)
             else:
-                for d, period in enumerate(self.periods):
-                    differences = wrap(self._centred[:, d] - some[:, d, None], period)  # (Q, M)
-                    offset[:, d] = (weights * differences).sum(dim=1)
+                for d, difference in enumerate(differences(some, self._centred, self.periods)):
+                    offset[:, d] = (weights * difference).sum(dim=-1)
             log_sum.copy_(log_sum_exp(exponents))
         return offsets, log_sums
 
@@ -133,7 +155,7 @@ class KernelSums:
 
     @cached_property
     def _centre(self) -> Tensor:
-        return mean(self.anchors)  # (D,)
+        return without_angles(mean(self.anchors), self.periods)  # (D,)
 
     @cached_property
     def _centred(self) -> Tensor:

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lerobot_pf2mp.density.kernels import mean, wrap
+from lerobot_pf2mp.density.kernels import checked_periods, mean, without_angles, wrap
 
 try:
     from lerobot_pf2mp.density import _kernel_tree
@@ -36,6 +36,25 @@ def is_available() -> bool:
     return _kernel_tree is not None
 
 
+def check_groups(groups: Tensor, count: int) -> None:
+    """Checks the group numbers of points.
+
+    Args:
+        groups: The group numbers.
+        count: The number of points.
+
+    Raises:
+        ValueError: If they are not ``(count,)`` int64, or do not fit into 32 bits.
+    """
+    if groups.shape != (count,) or groups.dtype != torch.int64:
+        raise ValueError(f"groups must be ({count},) int64, got {tuple(groups.shape)} {groups.dtype}")
+    # The neighbours of a group number must fit too.
+    if count and not (groups.min() > -(2**31) and groups.max() < 2**31 - 1):
+        raise ValueError(
+            f"group numbers must fit into 32 bits, got {groups.min().item()} to {groups.max().item()}"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class KernelTree:
     """A binary tree of L leaves that is full except for its last level.
@@ -45,11 +64,12 @@ class KernelTree:
     Args:
         leaves: ``(L, D, S)`` the anchors of each leaf, relative to the centre.
         boxes: ``(2 L - 1, 2, D)`` the lower and upper corner of each node's bounding box, relative to the centre.
-        centre: ``(D,)`` the mean of the anchors. Subtracting it keeps float32 precise for points far from the origin.
-        periods: ``(D,)`` the periods of angles, 0 for other dimensions; ``(0,)`` if there are no angles. Positions in an
-            angle lie within half a period of the centre.
+        centre: ``(D,)`` the mean of the anchors, zero for angles. Subtracting it keeps float32 precise for points far from
+            the origin.
+        periods: ``(D,)`` the periods of angles, 0 for other dimensions; ``(0,)`` if there are no angles.
         exponent_per_square: log2(e) / 2h^2. Times a squared distance it is the exponent e of a kernel 2^-e.
         exponent_range: A kernel is left out if it is smaller than 2^-exponent_range times that of the nearest anchor.
+        labels: ``(L, S)`` int32 group numbers of the anchors in the leaves, for `sums_without_own_group`.
     """
 
     leaves: Tensor
@@ -58,29 +78,59 @@ class KernelTree:
     periods: Tensor
     exponent_per_square: float
     exponent_range: float
+    labels: Tensor | None = None
 
     @classmethod
-    def of(cls, anchors: Tensor, bandwidth: float, periods: Tensor | None = None) -> KernelTree:
-        """Builds the tree of anchors ``(M, D)``, float32 on the CPU, M >= 1.
+    def of(
+        cls,
+        anchors: Tensor,
+        bandwidth: float,
+        periods: Tensor | None = None,
+        groups: Tensor | None = None,
+    ) -> KernelTree:
+        """Builds the tree of anchors.
 
         Args:
-            anchors: The anchors.
-            bandwidth: The kernel bandwidth h > 0.
-            periods: ``(D,)`` periods of angles, 0 for other dimensions; None if there are no angles.
+            anchors: ``(M, D)`` float32 on the CPU, M >= 1.
+            bandwidth: Standard deviation h > 0 of the kernels.
+            periods: ``(D,)`` the periods of angles, 0 for other dimensions; None stands for zeros.
+            groups: ``(M,)`` int64 group numbers, for `sums_without_own_group`.
+
+        Raises:
+            ValueError: If the periods or the groups are not those that `KernelSums` accepts.
         """
-        centre = mean(anchors)
-        positions = wrap(anchors - centre, periods).clamp(-_FARTHEST, _FARTHEST)
-        leaves = _in_leaves(positions[_order_of(anchors, periods)], _MISSING)
+        n_anchors, dim = anchors.shape
+        size = _kernel_tree.LEAF_SIZE
+        periods = checked_periods(periods, dim)
+        centre = without_angles(mean(anchors), periods)
+        if periods is not None:
+            anchors = wrap(anchors, periods)
+        order = torch.empty(n_anchors, dtype=torch.int64)
+        _kernel_tree.order_points(anchors.contiguous().numpy(), order.numpy())
+        positions = torch.full((-(-n_anchors // size) * size, dim), _MISSING)
+        positions[:n_anchors] = (anchors - centre)[order].clamp(-_FARTHEST, _FARTHEST)
+        leaves = positions.view(-1, size, dim)
+        # From left to right the leaves of the last level come first. In the numbering of nodes they come last.
+        full_level = 2 ** (len(leaves).bit_length() - 1)
+        n_rolled = 2 * (len(leaves) - full_level)
+        leaves = leaves.roll(-n_rolled, dims=0)
+        labels = None
+        if groups is not None:
+            check_groups(groups, n_anchors)
+            labels = torch.zeros(len(positions), dtype=torch.int32)
+            labels[:n_anchors] = groups[order].int()
+            labels = labels.view(-1, size).roll(-n_rolled, dims=0)
         return cls(
             leaves.transpose(1, 2).contiguous(),
             _boxes_around(leaves),
             centre,
-            torch.empty(0) if periods is None else periods.float().contiguous(),
+            centre.new_empty(0) if periods is None else periods,
             exponent_per_square=min(
                 max(math.log2(math.e) / 2 / bandwidth / bandwidth, _SMALLEST_EXPONENT_PER_SQUARE),
                 _LARGEST_EXPONENT_PER_SQUARE,
             ),
-            exponent_range=math.log2(len(anchors) / _LEFT_OUT),
+            exponent_range=math.log2(n_anchors / _LEFT_OUT),
+            labels=labels,
         )
 
     def sums(self, queries: Tensor) -> tuple[Tensor, Tensor]:
@@ -94,35 +144,28 @@ class KernelTree:
         )
         return offsets, log_sums
 
-    def sums_of_others(self, labels: Tensor, queries: Tensor, query_labels: Tensor) -> tuple[Tensor, Tensor]:
-        """The log sums, and the distances to the nearest anchor, over the anchors with other labels.
-
-        Args:
-            labels: ``(L, S)`` int32 labels of the anchors, see `labels_in_leaves`.
-            queries: ``(Q, D)`` float32.
-            query_labels: ``(Q,)`` int32. The anchors whose label differs from the query's by at most 1 are left out.
-
-        Returns:
-            ``(Q,)`` log sums and ``(Q,)`` distances; -inf and inf where no anchor remains.
-        """
-        queries = queries.contiguous()
-        log_sums, squares = torch.empty(len(queries)), torch.empty(len(queries))
+    def sums_without_own_group(self, queries: Tensor, groups: Tensor) -> tuple[Tensor, Tensor]:
+        """The log sums and distances of `KernelSums.sums_without_own_group`, for a tree with labels."""
+        if self.labels is None:
+            raise ValueError("the anchors must have groups, got None")
+        check_groups(groups, len(queries))
+        log_sums, distances = torch.empty(len(queries)), torch.empty(len(queries))
         _kernel_tree.sum_other_kernels(
             self._held,
-            labels.numpy(),
-            queries.numpy(),
-            query_labels.contiguous().numpy(),
+            self.labels.numpy(),
+            queries.contiguous().numpy(),
+            groups.int().contiguous().numpy(),
             log_sums.numpy(),
-            squares.numpy(),
+            distances.numpy(),
             torch.get_num_threads(),
         )
-        return log_sums, squares.sqrt()
+        return log_sums, distances
 
     def offsets_to(self, targets: KernelTree, queries: Tensor, log_sum_threshold: float) -> Tensor:
         """The offsets to the nearest target, for queries with a small kernel sum.
 
         Args:
-            targets: The tree of the target points.
+            targets: The tree of the target points, with the same periods.
             queries: ``(Q, D)`` float32.
             log_sum_threshold: Log sum above which the offset is zero.
 
@@ -154,7 +197,7 @@ class KernelTree:
         """Steps towards the local mean, and from there towards the nearest target if the kernel sum there is small.
 
         Args:
-            targets: The tree of the target points.
+            targets: The tree of the target points, with the same periods.
             queries: ``(Q, D)`` float32.
             log_sum_threshold: Log sum at the end of the first part above which there is no part towards a target.
             share: Fraction in [0, 1] of the offset to the local mean that a step covers.
@@ -183,15 +226,14 @@ class KernelTree:
 
     @property
     def _parts(self) -> tuple[Tensor, Tensor, Tensor, Tensor, float, float]:
-        numbers = self.exponent_per_square, self.exponent_range
-        return self.leaves, self.boxes, self.centre, self.periods, *numbers
+        arrays = self.leaves, self.boxes, self.centre, self.periods
+        return *arrays, self.exponent_per_square, self.exponent_range
 
     @cached_property
     def _held(self) -> tuple[NDArray, NDArray, NDArray, NDArray, float, float]:
-        leaves, boxes, centre, periods = (
-            x.numpy() for x in (self.leaves, self.boxes, self.centre, self.periods)
-        )
-        return leaves, boxes, centre, periods, self.exponent_per_square, self.exponent_range
+        leaves, boxes, centre, periods, exponent_per_square, exponent_range = self._parts
+        arrays = leaves.numpy(), boxes.numpy(), centre.numpy(), periods.numpy()
+        return *arrays, exponent_per_square, exponent_range
 
 
 # The methods of a tree as custom operators, which compiled graphs can call. Below each: the shapes of its results.
@@ -259,31 +301,6 @@ def _(*arguments: Tensor | float) -> Tensor:
     queries = arguments[12]
     assert isinstance(queries, Tensor)
     return queries.new_empty(queries.shape)
-
-
-def labels_in_leaves(labels: Tensor, anchors: Tensor, periods: Tensor | None = None) -> Tensor:
-    """The labels ``(M,)`` of anchors ``(M, D)`` in the order of the leaves of their tree, ``(L, S)`` int32."""
-    return _in_leaves(labels.int()[_order_of(anchors, periods)].unsqueeze(1), 0).squeeze(2).contiguous()
-
-
-def _order_of(anchors: Tensor, periods: Tensor | None) -> Tensor:
-    """The order ``(M,)`` of anchors in the leaves of their tree, from left to right."""
-    points = anchors if periods is None else wrap(anchors - mean(anchors), periods)
-    order = torch.empty(len(anchors), dtype=torch.int64)
-    _kernel_tree.order_points(points.contiguous().numpy(), order.numpy())
-    return order
-
-
-def _in_leaves(rows: Tensor, missing: float) -> Tensor:
-    """Rows ``(M, D)``, in the order of the leaves from left to right, as leaves ``(L, S, D)`` in the numbering of nodes."""
-    n_rows, dim = rows.shape
-    size = _kernel_tree.LEAF_SIZE
-    filled = torch.full((-(-n_rows // size) * size, dim), missing, dtype=rows.dtype)
-    filled[:n_rows] = rows
-    leaves = filled.view(-1, size, dim)
-    # From left to right the leaves of the last level come first. In the numbering of nodes they come last.
-    full_level = 2 ** (len(leaves).bit_length() - 1)
-    return leaves.roll(-2 * (len(leaves) - full_level), dims=0)
 
 
 def _boxes_around(leaves: Tensor) -> Tensor:
