@@ -76,21 +76,30 @@ def check_positions(actions: np.ndarray, states: np.ndarray, episodes: np.ndarra
     return ActionKind(float(with_states), float(with_changes))
 
 
-def warn_unless_positions(dataset: LeRobotDataset, dims: Sequence[int] | None) -> None:
-    """Warns in one line if a dataset's actions do not look like positions. A field over them says nothing about obstacles.
-
-    Actions are compared with ``observation.state`` if both have as many dimensions.
+def action_kind_of(dataset: LeRobotDataset, dims: Sequence[int] | None) -> ActionKind | None:
+    """`check_positions` for a dataset, on up to 20 000 frames of whole episodes spread over it.
 
     Args:
         dataset: The dataset, with the episodes that a field is fitted to.
         dims: Action dimensions that the field covers; None for all.
+
+    Returns:
+        The correlations; None if they cannot be told, or ``observation.state`` has other dimensions than the action.
     """
     columns = _read(dataset)
     if columns is None:
-        return
+        return None
     actions, states, episodes = columns
     chosen = list(range(actions.shape[1]) if dims is None else dims)
-    kind = check_positions(actions[:, chosen], states[:, chosen], episodes)
+    return check_positions(actions[:, chosen], states[:, chosen], episodes)
+
+
+def warn_unless_positions(dataset: LeRobotDataset, dims: Sequence[int] | None) -> None:
+    """Warns in one line if a dataset's actions do not look like positions. A field over them says nothing about obstacles.
+
+    Arguments as for `action_kind_of`.
+    """
+    kind = action_kind_of(dataset, dims)
     if kind is not None and not kind.are_positions:
         logger.warning(
             "The dataset's actions do not look like absolute positions: their rank correlation is %.2f with %s, and %.2f "
