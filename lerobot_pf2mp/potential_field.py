@@ -324,7 +324,7 @@ class JudgedFit:
 
     Args:
         field: The field. Its anchors are the points that are not outlying.
-        is_outlying: ``(P,)`` bool, points far from all others, see `HeldOut.outlying`.
+        is_outlying: ``(P,)`` bool, points far from all others, see `HeldOut.far_and_outlying`.
         log_density: ``(P,)`` log density of each point without its own episode [nats]; -inf if nothing else remains.
         distance: ``(P,)`` distance to the nearest point of another episode [normalised]; inf if nothing else remains.
     """
@@ -351,8 +351,8 @@ def fit(
     """Fits a potential field to demonstrated actions.
 
     Wherever the density judges an action that it was made from, it does so without that action's own episode: in the
-    choice of the bandwidth, in the quantile that bounds H, and in the choice of H's anchors. Points far from all others
-    are left out.
+    choice of the bandwidth, in the quantile that bounds H, and in the choice of H's anchors. Outlying points are left out
+    of the field; points far from other episodes do not count in the quantile (see `HeldOut.far_and_outlying`).
 
     Args:
         points: ``(P, D)`` demonstrated actions [normalised], P >= 1.
@@ -428,11 +428,12 @@ def fit_judged(
         return JudgedFit(field, torch.zeros(len(points), dtype=torch.bool), -nothing, nothing)
     h = select_bandwidth(on_cpu, bandwidth, groups=groups, periods=periods)
     log_density, distance = held_out.judge(h)
-    is_outlying = held_out.outlying(distance, h)
+    is_far, is_outlying = held_out.far_and_outlying(distance, h)
     if bool(is_outlying.any()):
         kept = HeldOut(on_cpu[~is_outlying], groups[~is_outlying], periods)
         log_density, distance = kept.judge(h, on_cpu, groups)
-    log_threshold = _just_below_quantile(log_density[~is_outlying], threshold_quantile)
+    # A way that only one episode went is no measure of what is usual.
+    log_threshold = _just_below_quantile(log_density[~is_far], threshold_quantile)
     field = PotentialField(
         points[~is_outlying.to(points.device)],
         h,

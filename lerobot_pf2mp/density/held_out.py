@@ -137,8 +137,8 @@ class HeldOut:
         """Whether there is a point that others can judge."""
         return bool((self._n_others(self.groups) > 0).any())
 
-    def outlying(self, distance: Tensor, bandwidth: float) -> Tensor:
-        """The points that are far from all others, such as single wrong values of a sensor.
+    def far_and_outlying(self, distance: Tensor, bandwidth: float) -> tuple[Tensor, Tensor]:
+        """The points that are far from other episodes, and those of them that are outlying: wrong values of a sensor.
 
         Far means `_FAR` times the distance that 90 % of the points have to the nearest point of another episode, and
         `_FAR` bandwidths. A path on which no other episode went is not outlying: its frames lead there step by step. So
@@ -151,16 +151,19 @@ class HeldOut:
             bandwidth: h [normalised].
 
         Returns:
-            ``(P,)`` bool.
+            ``(P,)`` bool each.
         """
         known = distance[distance.isfinite()]
         if not len(known):
-            return torch.zeros(len(distance), dtype=torch.bool)
+            nothing = torch.zeros(len(distance), dtype=torch.bool)
+            return nothing, nothing
         usual = known.kthvalue(max(1, math.ceil(_USUAL_QUANTILE * len(known)))).values.item()
         limit = _FAR * max(usual, bandwidth)
         is_beyond = self._is_beyond_gap(limit)
         is_far = is_beyond | (distance > limit) & distance.isfinite()
-        return is_far & ~self._joined_to(~is_far, limit) if bool(is_far.any()) else is_far
+        if not bool(is_far.any()):
+            return is_far, is_far
+        return is_far, is_far & ~self._joined_to(~is_far, limit)
 
     def _is_beyond_gap(self, limit: float) -> Tensor:
         """Whether a gap wider than `limit` in one coordinate separates a point, with few others, from the rest."""
