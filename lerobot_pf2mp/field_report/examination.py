@@ -68,7 +68,7 @@ def make_field_report(
     periods = judged.field.periods
     others = OtherEpisodes(sample.actions[kept], groups[kept], field.bandwidth, periods)
     log_density, distance = others(frames.actions, frame_groups)
-    is_outlying = HeldOut(frames.actions, frame_groups, periods, frames.numbers).outlying(
+    _, is_outlying = HeldOut(frames.actions, frame_groups, periods, frames.numbers).far_and_outlying(
         distance, field.bandwidth
     )
     thresholds = Thresholds(
