@@ -4,14 +4,15 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, fields
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import torch
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.lerobot_types import TransitionKey
@@ -23,10 +24,15 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lerobot_pf2mp.errors import explained
+from lerobot_pf2mp.field_report.of_dataset import report_on_dataset
+from lerobot_pf2mp.field_report.report import FieldReport
 from lerobot_pf2mp.loading import load_config
-from lerobot_pf2mp.policies.guided.action_units import normalised_unit
+from lerobot_pf2mp.policies.guided.action_kind import warn_unless_positions
+from lerobot_pf2mp.policies.guided.action_units import normalised_unit, normaliser_of
 from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
 from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
+from lerobot_pf2mp.policies.guided.relative_actions import refuse_relative_actions
+from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
 from lerobot_pf2mp.process.atomic_files import written_beside
 
 GUIDED_TYPES = {"fmp": "pf2mp", "pf2mp": "pf2mp", "diffusion": "dppf", "dppf": "dppf"}
@@ -45,6 +51,7 @@ def fit_field(
     checkpoint_revision: str | None = None,
     options: dict[str, Any] | None = None,
     overwrite: bool = False,
+    report: Callable[[FieldReport], None] | None = None,
 ) -> PreTrainedConfig:
     """Writes a new checkpoint with the same weights, guided by the field of a dataset's actions.
 
@@ -61,13 +68,14 @@ def fit_field(
         checkpoint_revision: Branch, tag or commit of the checkpoint on the Hub.
         options: Fields of `GuidedConfig` to change.
         overwrite: Whether a checkpoint already at `output_dir` is replaced.
+        report: Gets the report on the field, before the checkpoint appears; None makes no report.
 
     Returns:
         The new policy's configuration.
 
     Raises:
-        ValueError: If the checkpoint has another type, its actions have another shape than the dataset's, or an option
-            breaks its rule.
+        ValueError: If the checkpoint has another type, its actions are relative or have another shape than the dataset's,
+            or an option breaks its rule.
         OSError: If the checkpoint or the dataset cannot be read.
         FileExistsError: If `output_dir` exists and `overwrite` is false.
     """
@@ -77,13 +85,17 @@ def fit_field(
     device, config.device, guided.device = guided.device, "cpu", "cpu"
     with written_beside(
         output_dir, overwrite, kind="checkpoint", mark="config.json", option="--output_dir"
-    ) as partial:
+    ) as new:
         with explained(f"the checkpoint {checkpoint} cannot be loaded"):
             policy_class = get_policy_class(guided.type)
             policy = policy_class.from_pretrained(checkpoint, config=guided, revision=checkpoint_revision)
             preprocessor, postprocessor = _load_processors(config, str(checkpoint), checkpoint_revision)
+        refuse_relative_actions(preprocessor.steps)
         dataset = _load_dataset(repo_id, root, episodes, dataset_revision)
-        step = _fitted_step(guided, dataset, preprocessor)
+        warn_unless_positions(dataset, guided.field_settings.action_dims)
+        step = _fitted_step(guided, dataset, preprocessor.steps)
+        if report is not None:
+            report(report_on_dataset(step.demonstrations, dataset, partial(_normalise, preprocessor.steps)))
         preprocessor.steps = [
             *(old for old in preprocessor.steps if not isinstance(old, PotentialFieldProcessorStep)),
             step,
@@ -94,8 +106,62 @@ def fit_field(
             if isinstance(old, DeviceProcessorStep):
                 old.device = str(device)
         for part in (policy, preprocessor, postprocessor):
-            part.save_pretrained(partial)
+            part.save_pretrained(new)
     return guided
+
+
+def examine_dataset(
+    *,
+    repo_id: str,
+    root: Path | None = None,
+    episodes: Sequence[int] | None = None,
+    dataset_revision: str | None = None,
+    checkpoint: str | Path | None = None,
+    checkpoint_revision: str | None = None,
+    options: dict[str, Any] | None = None,
+) -> FieldReport:
+    """The report on the field that a policy would get from a dataset. Nothing is trained and no checkpoint is written.
+
+    Args:
+        repo_id: As for `fit_field`, like the other arguments.
+        root: As there.
+        episodes: As there.
+        dataset_revision: As there.
+        checkpoint: The policy. With None it is a pf2mp policy with its default options, whose actions are normalised by the
+            dataset's own statistics.
+        checkpoint_revision: As there.
+        options: Fields of `GuidedConfig` to change.
+
+    Raises:
+        ValueError: As for `fit_field`, or if the dataset has no actions.
+        OSError: If the checkpoint or the dataset cannot be read.
+    """
+    config: PreTrainedConfig
+    if checkpoint is None:
+        config = PF2MPConfig(device="cpu", **(options or {}))
+        dataset = _load_dataset(repo_id, root, episodes, dataset_revision)
+        steps = [_normaliser_for(config, dataset)]
+    else:
+        loaded = load_config(checkpoint, revision=checkpoint_revision, device="cpu")
+        config = _guided_config(loaded, options or {})
+        with explained(f"the checkpoint {checkpoint} cannot be loaded"):
+            preprocessor, _ = _load_processors(loaded, str(checkpoint), checkpoint_revision)
+        steps = list(preprocessor.steps)
+        refuse_relative_actions(steps)
+        dataset = _load_dataset(repo_id, root, episodes, dataset_revision)
+    step = _fitted_step(config, dataset, steps)
+    return report_on_dataset(step.demonstrations, dataset, partial(_normalise, steps))
+
+
+def _normaliser_for(config: PreTrainedConfig, dataset: LeRobotDataset) -> NormalizerProcessorStep:
+    """The normaliser that training on the dataset would make; `config` gets the dataset's action."""
+    shape = tuple(dataset.meta.features.get(ACTION, {}).get("shape", ()))
+    if len(shape) != 1 or ACTION not in (dataset.meta.stats or {}):
+        raise ValueError(
+            f"the dataset must have actions that are vectors, with statistics, got the features {list(dataset.meta.features)}"
+        )
+    config.output_features = {ACTION: PolicyFeature(FeatureType.ACTION, shape)}
+    return normaliser_of(config, cast(dict[str, Any], dataset.meta.stats))
 
 
 def _load_processors(
@@ -144,7 +210,7 @@ def _guided_config(config: PreTrainedConfig, options: dict[str, Any]) -> PreTrai
 
 
 def _fitted_step(
-    config: PreTrainedConfig, dataset: LeRobotDataset, preprocessor: PolicyProcessorPipeline
+    config: PreTrainedConfig, dataset: LeRobotDataset, steps: Sequence[Any]
 ) -> PotentialFieldProcessorStep:
     """A new step for the preprocessor, with the field of the dataset's actions."""
     wanted = config.action_feature.shape
@@ -154,7 +220,7 @@ def _fitted_step(
     settings = cast(GuidedConfig, config).field_settings
     step = PotentialFieldProcessorStep(**asdict(settings))
     unit = torch.ones(shape)
-    for normaliser in preprocessor.steps:
+    for normaliser in steps:
         if isinstance(normaliser, NormalizerProcessorStep):
             unit = normalised_unit(normaliser, *shape)
     frames = dataset.hf_dataset.with_format("numpy", columns=[ACTION, "index", "episode_index"])
@@ -162,7 +228,7 @@ def _fitted_step(
     for start in tqdm(starts, desc="Reading actions", unit="block", disable=len(starts) < 2):
         block = frames[start : start + _FRAMES_AT_ONCE]
         actions = torch.from_numpy(np.array(block[ACTION], dtype=np.float32)).reshape(-1, 1, *shape)
-        actions = _normalise(actions, preprocessor)
+        actions = _normalise(steps, actions)
         episodes = torch.from_numpy(block["episode_index"])
         # Without a dataset_id, training that continues from this checkpoint fits a new field, to its own data.
         step.demonstrations.observe(
@@ -175,9 +241,9 @@ def _fitted_step(
     return step
 
 
-def _normalise(actions: Tensor, preprocessor: PolicyProcessorPipeline) -> Tensor:
+def _normalise(steps: Sequence[Any], actions: Tensor) -> Tensor:
     transition: Any = {TransitionKey.ACTION: actions}
-    for step in preprocessor.steps:
+    for step in steps:
         if isinstance(step, NormalizerProcessorStep):
             transition = step(transition)
     return transition[TransitionKey.ACTION]

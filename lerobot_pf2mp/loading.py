@@ -17,6 +17,7 @@ from lerobot_pf2mp.errors import explained
 from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
 from lerobot_pf2mp.policies.guided.field_guidance import fitted_field
 from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
+from lerobot_pf2mp.policies.guided.relative_actions import refuse_relative_actions
 from lerobot_pf2mp.potential_field import PotentialField
 
 
@@ -41,8 +42,8 @@ def load_policy(
     Raises:
         FileNotFoundError: If the path is neither a folder nor the name of a repository.
         OSError: If the checkpoint cannot be read or reached.
-        ValueError: If an option does not exist or cannot have its value, a file is damaged, or guidance is on without a
-            potential field.
+        ValueError: If an option does not exist or cannot have its value, a file is damaged, guidance is on without a
+            potential field, or actions are relative beside one.
     """
     config = load_config(path, revision=revision, device=device, **overrides)
     path = str(config.pretrained_path)
@@ -56,6 +57,8 @@ def load_policy(
             pretrained_revision=revision,
             preprocessor_overrides={"device_processor": {"device": config.device}},
         )
+        if any(isinstance(step, PotentialFieldProcessorStep) for step in preprocessor.steps):
+            refuse_relative_actions(preprocessor.steps)
         if isinstance(config, GuidedConfig) and config.guidance_scale > 0:
             loaded_field(config, preprocessor)
     return policy, preprocessor, postprocessor

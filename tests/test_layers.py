@@ -13,7 +13,7 @@ FLOORS = (
     ("commands",),
     ("figures",),
     ("benchmark", "fit_field"),
-    ("loading",),
+    ("loading", "field_report"),
     ("policies",),
     ("dataset_tools", "hub"),
     ("envs", "results", "guidance"),

@@ -27,6 +27,11 @@ def gather_rows(*tensors: Tensor | None) -> tuple[Tensor | None, ...]:
     return tuple(None if tensor is None else _gather_counted(tensor, counts) for tensor in tensors)
 
 
+def is_main_process() -> bool:
+    """Whether this process is the only one of its training run, or the one that logs and saves."""
+    return not (dist.is_available() and dist.is_initialized()) or dist.get_rank() == 0
+
+
 def _gather_counted(rows: Tensor, counts: list[int]) -> Tensor:
     """Gathers different numbers of rows. Collectives need equal shapes, so rows are padded to the largest count."""
     padded = rows.new_zeros(max(counts), *rows.shape[1:])

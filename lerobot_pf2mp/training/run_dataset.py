@@ -24,9 +24,9 @@ def find_dataset(dataset_meta: Any) -> LeRobotDataset | StreamingLeRobotDataset 
         return None
     for candidate in gc.get_objects():
         # By type: isinstance would ask proxies for their class.
-        if issubclass(type(candidate), LeRobotDataset | StreamingLeRobotDataset):
-            if vars(candidate).get("meta") is dataset_meta:
-                return candidate
+        is_dataset = issubclass(type(candidate), LeRobotDataset | StreamingLeRobotDataset)
+        if is_dataset and vars(candidate).get("meta") is dataset_meta:
+            return candidate
     return None
 
 

@@ -62,6 +62,11 @@ class DemonstratedActions:
         return len(self._ranks)
 
     @property
+    def points(self) -> Tensor:
+        """``(P, D)`` actions of the sample's frames [normalised]."""
+        return self._points.cpu()
+
+    @property
     def episodes(self) -> Tensor | None:
         """``(P,)`` int64 episode numbers of the sample's frames; None if they are unknown."""
         return self._episodes.cpu() if len(self) and bool((self._episodes >= 0).all()) else None

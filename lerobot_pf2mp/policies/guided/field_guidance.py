@@ -11,18 +11,20 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
 from lerobot_pf2mp.flow_matching import Guide
 from lerobot_pf2mp.guidance import GuidanceSettings, make_guide
 from lerobot_pf2mp.policies.batch_keys import ACTION_IS_PAD, POTENTIAL_FIELD
+from lerobot_pf2mp.policies.guided.action_kind import warn_unless_positions
 from lerobot_pf2mp.policies.guided.action_units import normalised_unit, normaliser_of
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
 from lerobot_pf2mp.policies.guided.support_monitor import SupportMonitor
 from lerobot_pf2mp.potential_field import PotentialField
-from lerobot_pf2mp.training.gathering import gather_rows
-from lerobot_pf2mp.training.run_dataset import run_episodes
+from lerobot_pf2mp.training.gathering import gather_rows, is_main_process
+from lerobot_pf2mp.training.run_dataset import find_dataset, run_episodes
 
 if TYPE_CHECKING:
     from lerobot_pf2mp.policies.dppf.configuration_dppf import DPPFConfig
@@ -51,13 +53,14 @@ class FieldGuidance:
         self.config = config
         self._dataset_id = _identify_dataset(dataset_stats, run_episodes(dataset_meta), config)
         self._unit = _unit_of_actions(dataset_stats, config)
+        self._unchecked_meta = dataset_meta  # until its dataset's actions have been looked at
         self.demonstrations: DemonstratedActions | None = None  # those of the last training batch
         self._monitor = SupportMonitor(config.on_unsupported, config.field_action_dims)
         self._made: tuple[PotentialField, GuidanceSettings, Guide | None] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """The state for copies and pickles of the policy. A copy makes its own guide."""
-        return {**vars(self), "_made": None}
+        return {**vars(self), "_made": None, "_unchecked_meta": None}
 
     def reset(self) -> None:
         """Forgets the last chunk. Must be called at the start of an episode."""
@@ -84,6 +87,8 @@ class FieldGuidance:
         if demonstrations is None:
             return
         self.demonstrations = demonstrations
+        if self._unchecked_meta is not None:
+            self._check_dataset()
         actions, is_pad, frames, episodes = gather_rows(
             batch[ACTION], batch.get(ACTION_IS_PAD), batch.get("index"), batch.get("episode_index")
         )
@@ -96,6 +101,13 @@ class FieldGuidance:
             unit=self._unit,
             dataset_id=self._dataset_id,
         )
+
+    @torch.compiler.disable
+    def _check_dataset(self) -> None:
+        """Warns if the actions of the run's dataset are no positions. A streaming dataset is not looked at."""
+        dataset, self._unchecked_meta = find_dataset(self._unchecked_meta), None
+        if isinstance(dataset, LeRobotDataset) and is_main_process():
+            warn_unless_positions(dataset, self.config.field_action_dims)
 
     @torch.compiler.disable  # the field may have to be fitted first
     def guide(self, batch: dict[str, Any], device: torch.device) -> Guide | None:

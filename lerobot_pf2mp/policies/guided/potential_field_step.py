@@ -31,6 +31,7 @@ from torch import Tensor
 from lerobot_pf2mp.policies.batch_keys import POTENTIAL_FIELD
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
 from lerobot_pf2mp.policies.guided.field_settings import FieldSettings
+from lerobot_pf2mp.policies.guided.relative_actions import refuse_relative_actions_beside
 
 
 @ProcessorStepRegistry.register("potential_field")
@@ -43,9 +44,17 @@ class PotentialFieldProcessorStep(ProcessorStep):
 
     def __init__(self, **settings: Any) -> None:
         self.demonstrations = DemonstratedActions(FieldSettings(**settings))
+        self._has_been_called = False
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
-        """The transition with the demonstrations under the complementary key `POTENTIAL_FIELD`."""
+        """The transition with the demonstrations under the complementary key `POTENTIAL_FIELD`.
+
+        Raises:
+            ValueError: If another step of the preprocessor makes actions relative, at the first call.
+        """
+        if not self._has_been_called:
+            refuse_relative_actions_beside(self)
+            self._has_been_called = True
         transition = transition.copy()
         complementary_data = dict(transition.get(TransitionKey.COMPLEMENTARY_DATA) or {})
         complementary_data[POTENTIAL_FIELD] = self.demonstrations
