@@ -13,8 +13,10 @@ from lerobot_pf2mp.density.held_out import N_BLOCKS, HeldOut, group_numbers
 from lerobot_pf2mp.potential_field import PotentialField, fit, fit_judged
 
 
-def strokes(n_episodes: int, n_frames: int = 100, dim: int = 2, spread: float = 0.05) -> tuple[Tensor, Tensor]:
-    """Episodes that follow one curve, each with its own smooth deviation. Successive frames are much nearer than episodes."""
+def strokes(
+    n_episodes: int, n_frames: int = 100, dim: int = 2, spread: float = 0.05
+) -> tuple[Tensor, Tensor]:
+    """Episodes along one curve, each with its own smooth deviation. Successive frames are nearer than episodes."""
     t = torch.linspace(0, 1, n_frames)
     phases = torch.linspace(0, 3, dim)
     curve = torch.sin(2 * math.pi * t.unsqueeze(1) + phases)  # (T, D)
@@ -110,7 +112,11 @@ def test_one_percent_of_wrong_values_of_any_size_change_neither_bandwidth_nor_th
     clean = fit(points, episodes=episodes)
     bad = torch.randperm(len(points))[: len(points) // 100]
     spoilt = points.clone()
-    spoilt[bad] = size * torch.nn.functional.normalize(torch.randn(len(bad), dim), dim=1) * (1 + torch.rand(len(bad), 1))
+    spoilt[bad] = (
+        size
+        * torch.nn.functional.normalize(torch.randn(len(bad), dim), dim=1)
+        * (1 + torch.rand(len(bad), 1))
+    )
     judged = fit_judged(spoilt, episodes=episodes)
     assert judged.field.bandwidth == pytest.approx(clean.bandwidth, rel=0.1)
     good = torch.ones(len(points), dtype=torch.bool)
@@ -213,7 +219,9 @@ def test_a_field_over_an_angle_is_the_same_wherever_the_angle_is_cut(engine, alp
     assert field.bandwidth == pytest.approx(plain.bandwidth, rel=0.02)
     a = 0.3 * torch.randn(50, 2)
     b = a + torch.tensor([0.97, 0.0]) + torch.tensor([2.0, 0.0]) * torch.randint(-3, 4, (50, 1))
-    plain = PotentialField(plain.anchors, field.bandwidth, field.log_threshold, alpha, None, plain.anchor_is_safe)
+    plain = PotentialField(
+        plain.anchors, field.bandwidth, field.log_threshold, alpha, None, plain.anchor_is_safe
+    )
     field = PotentialField(
         field.anchors, field.bandwidth, field.log_threshold, alpha, periods, plain.anchor_is_safe
     )
@@ -236,7 +244,10 @@ def test_the_score_is_small_at_the_cut_of_an_angle():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"episodes": torch.zeros(3, dtype=torch.int64)}, r"episodes must be whole numbers of shape \(10,\), got \(3,\)"),
+        (
+            {"episodes": torch.zeros(3, dtype=torch.int64)},
+            r"episodes must be whole numbers of shape \(10,\), got \(3,\)",
+        ),
         ({"episodes": torch.zeros(10)}, "episodes must be whole numbers"),
         ({"times": torch.zeros(10, 1, dtype=torch.int64)}, "times must be whole numbers"),
         ({"periods": torch.zeros(3)}, "periods must be 2 finite numbers of at least 0"),

@@ -553,7 +553,7 @@ def test_a_field_over_other_dimensions_is_an_error():
 
 
 def test_settings_changed_at_evaluation_take_effect():
-    policy = pf2mp(field_bandwidth=0.3).eval()
+    policy = pf2mp(field_bandwidth=0.3, field_threshold_quantile=0.5).eval()
     batch, noise = {**observations(policy), POTENTIAL_FIELD: demonstrations(policy.config)}, noise_for()
     seen = [policy.predict_action_chunk(batch, noise=noise)]
     for name, value in {"guidance_scale": 0.01, "field_bandwidth": 0.1, "field_alpha": -5.0}.items():

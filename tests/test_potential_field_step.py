@@ -333,9 +333,12 @@ def test_a_state_of_other_dimensions_is_an_error():
     ("settings", "message"),
     [
         ({"n_points": 0}, "n_field_points must be at least 1, got 0"),
-        ({"action_dims": ()}, "field_action_dims must name at least one dimension"),
+        ({"action_dims": ()}, "field_action_dims must be distinct indices from 0 on"),
         ({"action_dims": (0, "1")}, "field_action_dims must be whole numbers"),
-        ({"action_dims": (0,), "angle_dims": (1,)}, r"field_angle_dims must be among field_action_dims \(0,\)"),
+        (
+            {"action_dims": (0,), "angle_dims": (1,)},
+            r"field_angle_dims must be among field_action_dims \(0,\)",
+        ),
         ({"angle_dims": (1, 1)}, "field_angle_dims must be distinct indices from 0 on"),
         ({"angle_period": 0.0}, "field_angle_period must be finite and positive, got 0.0"),
         ({"leave_out": "frame"}, r"field_leave_out must be one of \('episode', 'nothing'\), got 'frame'"),

@@ -161,9 +161,9 @@ def _most_likely_bandwidth(points: Tensor, smallest: float, largest: float, n_po
 def _most_likely_across_groups(held_out: HeldOut) -> float:
     """The bandwidth with the largest mean log density of points, each judged by other episodes.
 
-    The least likely and the likeliest `_LEFT_OUT_SHARE` of the points do not count. Points of an episode within a cell of `_REST` h count
-    once: a robot that stands still says nothing new, however long it does so and however its sensors tremble. The cells
-    need h, so h is found by iteration, from above.
+    The least likely and the likeliest `_LEFT_OUT_SHARE` of the points do not count. Points of an episode within a cell of
+    `_REST` h count once: a robot that stands still says nothing new, however long it does so and however its sensors
+    tremble. The cells need h, so h is found by iteration, from above.
     """
     spread = robust_spread(held_out.points, held_out.periods)
     smallest, largest = _SMALLEST_BANDWIDTH * spread, 3 * spread

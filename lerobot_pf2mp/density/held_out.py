@@ -112,7 +112,9 @@ class HeldOut:
             clamped = self.points.clamp(median - limit, median + limit)
             object.__setattr__(self, "points", clamped)
 
-    def judge(self, bandwidth: float, queries: Tensor | None = None, groups: Tensor | None = None) -> Judgement:
+    def judge(
+        self, bandwidth: float, queries: Tensor | None = None, groups: Tensor | None = None
+    ) -> Judgement:
         """The judgement over some points.
 
         Args:

@@ -12,7 +12,7 @@ from torch import Tensor
 from lerobot_pf2mp.policies.guided.field_settings import FieldSettings
 from lerobot_pf2mp.policies.guided.field_state import ANCHOR, OUTLYING, SAFE_ANCHOR, FieldState
 from lerobot_pf2mp.policies.guided.frame_ranks import frame_of, rank_of
-from lerobot_pf2mp.policies.guided.recorded_angles import jumps_by_a_period
+from lerobot_pf2mp.policies.guided.recorded_angles import JUMP, steps_seen
 from lerobot_pf2mp.policies.guided.remarks import remarks_on_dimensions, remarks_on_outlying
 from lerobot_pf2mp.potential_field import JudgedFit, PotentialField, fit, fit_judged
 
@@ -40,7 +40,7 @@ class DemonstratedActions:
 
     def _forget_units(self) -> None:
         self._unit = torch.empty(0)  # (D,) one recorded unit [normalised]; empty if unknown
-        self._jumps = torch.empty(0, dtype=torch.bool)  # (D,) whether recorded values jump by a period
+        self._steps = torch.empty(0, dtype=torch.uint8)  # (D,) `steps_seen` so far; empty if unknown
 
     def _start_afresh(self, dataset_id: bytes, why: str = "") -> None:
         if why:
@@ -137,10 +137,12 @@ class DemonstratedActions:
         """
         self._unit = _select_dims(unit.float(), self.settings.action_dims).cpu()
         actions = _select_dims(actions, self.settings.action_dims)
-        jumps = jumps_by_a_period(actions, is_pad, self._unit * self.settings.angle_period)
-        if bool((jumps & ~self._jumps).any()) if len(self._jumps) else bool(jumps.any()):
+        steps = steps_seen(actions, is_pad, self._unit * self.settings.angle_period)
+        if len(self._steps):
+            steps |= self._steps
+        if not torch.equal(steps == JUMP, self._steps == JUMP):
             self._fitted = None
-        self._jumps = jumps | self._jumps if len(self._jumps) else jumps
+        self._steps = steps
 
     def field(
         self, settings: FieldSettings | None = None, device: torch.device | str = "cpu"
@@ -201,7 +203,7 @@ class DemonstratedActions:
             log_threshold=torch.tensor(field.log_threshold, dtype=torch.float64),
             episodes=self._episodes.cpu().contiguous(),
             unit=self._unit.clone(),
-            jumps=self._jumps.clone(),
+            steps=self._steps.clone(),
             role=role,
         ).tensors()
 
@@ -221,7 +223,7 @@ class DemonstratedActions:
                 f"the potential field file must cover the action dimensions {dims}, got points of {dim}"
             )
         self._points, self._ranks, self._episodes = read.points.float(), read.ranks, read.episodes
-        self._unit, self._jumps = read.unit.float(), read.jumps
+        self._unit, self._steps = read.unit.float(), read.steps
         self._n_shown = int(read.n_shown)
         self._dataset_id = bytes(read.dataset_id.tolist())
         role = read.role[: self.settings.n_points]
@@ -282,7 +284,7 @@ class DemonstratedActions:
         """``(D,)`` the periods of the field's dimensions [normalised], 0 for those that are no angles."""
         dims = settings.action_dims or tuple(range(self._points.shape[1]))
         if settings.angle_dims is None:
-            is_angle = self._jumps
+            is_angle = self._steps == JUMP
         else:
             if settings.angle_dims and not len(self._unit):
                 raise ValueError(

@@ -49,9 +49,9 @@ class FieldSettings:
             raise ValueError(f"n_field_points must be at least 1, got {self.n_points}")
         if self.action_dims is not None:
             object.__setattr__(self, "action_dims", tuple(self.action_dims))
-            _check_dims("field_action_dims", self.action_dims)
             if not self.action_dims:
-                raise ValueError("field_action_dims must name at least one dimension, got ()")
+                raise ValueError("field_action_dims must be distinct indices from 0 on, got ()")
+            _check_dims("field_action_dims", self.action_dims)
         if self.angle_dims is not None:
             object.__setattr__(self, "angle_dims", tuple(self.angle_dims))
             _check_dims("field_angle_dims", self.angle_dims)

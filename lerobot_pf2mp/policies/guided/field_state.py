@@ -25,7 +25,7 @@ class FieldState:
         log_threshold: Log density that bounds the safe set, float64 [nats].
         episodes: ``(P,)`` int64 episode numbers, -1 if unknown.
         unit: ``(D,)`` one recorded unit [normalised]; empty if unknown.
-        jumps: ``(D,)`` bool, whether recorded values jump by a period; empty if unknown.
+        steps: ``(D,)`` uint8, see `steps_seen`; empty if unknown.
         role: ``(P,)`` uint8: `OUTLYING`, `ANCHOR` or `SAFE_ANCHOR`.
     """
 
@@ -37,7 +37,7 @@ class FieldState:
     log_threshold: Tensor
     episodes: Tensor
     unit: Tensor
-    jumps: Tensor
+    steps: Tensor
     role: Tensor
 
     def tensors(self) -> dict[str, Tensor]:
@@ -48,13 +48,13 @@ class FieldState:
     def read(cls, tensors: dict[str, Tensor]) -> FieldState:
         """The state in a file's tensors.
 
-        Files of before 0.2 have no episodes, unit, jumps and role. Their episodes are unknown, none of their dimensions
+        Files of before 0.2 have no episodes, unit, steps and role. Their episodes are unknown, none of their dimensions
         is an angle, and all points are anchors.
 
         Raises:
             ValueError: If an entry is missing or of the wrong kind, as in a corrupted file.
         """
-        added = {"episodes", "unit", "jumps", "role"}
+        added = {"episodes", "unit", "steps", "role"}
         wanted = {field.name for field in fields(cls)} - added
         if not wanted <= set(tensors):
             raise ValueError(
@@ -75,7 +75,7 @@ class FieldState:
         defaults = {
             "episodes": torch.full((len(points),), -1),
             "unit": torch.empty(0),
-            "jumps": torch.empty(0, dtype=torch.bool),
+            "steps": torch.empty(0, dtype=torch.uint8),
             "role": torch.full((len(points),), ANCHOR, dtype=torch.uint8),
         }
         state = cls(**{name: {**defaults, **tensors}[name] for name in wanted | added})
@@ -88,7 +88,7 @@ class FieldState:
             ("episodes", self.episodes, n_points, torch.int64),
             ("role", self.role, n_points, torch.uint8),
             ("unit", self.unit, dim, torch.float32),
-            ("jumps", self.jumps, dim, torch.bool),
+            ("steps", self.steps, dim, torch.uint8),
         ):
             is_unknown = size == dim and not len(value)
             if value.dtype != dtype or (value.shape != (size,) and not is_unknown):

@@ -30,7 +30,7 @@ def frame_of(ranks: Tensor) -> Tensor:
 
 
 def _shifted(x: Tensor, n_bits: int) -> Tensor:
-    """x >> n_bits as if x were unsigned."""
+    """X >> n_bits as if x were unsigned."""
     return (x >> n_bits) & ((1 << (64 - n_bits)) - 1)
 
 

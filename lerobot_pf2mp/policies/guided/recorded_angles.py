@@ -6,28 +6,34 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-# Largest deviation of a jump from the period, relative to the period.
-_TOLERANCE = 0.1
+# What was seen in a dimension. It is an angle if there were jumps and no leaps.
+JUMP, LEAP = 1, 2
+
+# Largest deviation of a jump from the period, and smallest step that is a leap, relative to the period.
+_JUMP_TOLERANCE, _LEAP = 0.1, 0.25
 
 
-def jumps_by_a_period(actions: Tensor, is_pad: Tensor | None, periods: Tensor) -> Tensor:
-    """The dimensions in which actions jump by a period between two frames.
+def steps_seen(actions: Tensor, is_pad: Tensor | None, periods: Tensor) -> Tensor:
+    """The kinds of large steps between successive actions.
 
-    The values of such a dimension must also lie within one period, as those of wrapped angles do.
+    A jump is a step of one period. A leap is another step of more than a quarter of it, or a range of values wider than
+    the period: so moves no joint whose angle is recorded within one turn.
 
     Args:
         actions: ``(B, T, D)`` successive actions [normalised].
-        is_pad: ``(B, T)`` true where a chunk reaches beyond its episode; None if none does.
+        is_pad: ``(B, T)`` true where an action does not follow the one before it; None if all do.
         periods: ``(D,)`` the period that each dimension has if it is an angle [normalised]; 0 if it cannot be one.
 
     Returns:
-        ``(D,)`` bool, on the CPU.
+        ``(D,)`` uint8 on the CPU: the sum of `JUMP` and `LEAP`, where seen.
     """
     periods = periods.to(actions.device)
-    differences = actions.diff(dim=1)  # (B, T - 1, D)
+    sizes = actions.diff(dim=1).abs()  # (B, T - 1, D)
     if is_pad is not None:
-        differences = differences.masked_fill(is_pad[:, 1:].unsqueeze(-1), 0.0)
-    jumps = (differences.abs() - periods).abs() < _TOLERANCE * periods  # (B, T - 1, D)
+        sizes = sizes.masked_fill(is_pad[:, 1:].unsqueeze(-1), 0.0)
+    jumps = ((sizes - periods).abs() < _JUMP_TOLERANCE * periods).flatten(end_dim=1)
+    leaps = (sizes > _LEAP * periods).flatten(end_dim=1) & ~jumps
     flat = actions.flatten(end_dim=1)  # (B T, D)
-    fits = flat.amax(dim=0) - flat.amin(dim=0) < (1 + _TOLERANCE) * periods
-    return (jumps.flatten(end_dim=1).any(dim=0) & fits).cpu()
+    is_wide = flat.amax(dim=0) - flat.amin(dim=0) > (1 + _JUMP_TOLERANCE) * periods
+    seen = JUMP * jumps.any(dim=0).to(torch.uint8) + LEAP * (leaps.any(dim=0) | is_wide).to(torch.uint8)
+    return seen.cpu()
