@@ -72,7 +72,7 @@ def plot_dimensions(output: Path, *, report: FieldReport, background: str = "lig
                 f"{share:.0f} %{kind}", (share, place), (4, 0), textcoords="offset points", va="center"
             )
         axis.set(xlabel="share of the squared distance to the nearest action of another episode [%]")
-        axis.set_xlim(0, 1.18 * max(*shares, 1.0))
+        axis.set_xlim(0, 1.25 * max(*shares, 1.0))
         _finish(axis, theme)
 
 
