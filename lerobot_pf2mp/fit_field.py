@@ -158,7 +158,8 @@ def _normaliser_for(config: PreTrainedConfig, dataset: LeRobotDataset) -> Normal
     shape = tuple(dataset.meta.features.get(ACTION, {}).get("shape", ()))
     if len(shape) != 1 or ACTION not in (dataset.meta.stats or {}):
         raise ValueError(
-            f"the dataset must have actions that are vectors, with statistics, got the features {list(dataset.meta.features)}"
+            "the dataset must have actions that are vectors, with statistics, got the features "
+            f"{list(dataset.meta.features)}"
         )
     config.output_features = {ACTION: PolicyFeature(FeatureType.ACTION, shape)}
     return normaliser_of(config, cast(dict[str, Any], dataset.meta.stats))

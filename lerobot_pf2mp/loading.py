@@ -15,6 +15,7 @@ from lerobot.processor import PolicyAction, PolicyProcessorPipeline
 
 from lerobot_pf2mp.errors import explained
 from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
+from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
 from lerobot_pf2mp.policies.guided.field_guidance import fitted_field
 from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
 from lerobot_pf2mp.policies.guided.relative_actions import refuse_relative_actions
@@ -76,9 +77,23 @@ def loaded_field(
     Raises:
         ValueError: If there is no field, it is not fitted, or it covers other dimensions than the policy's.
     """
+    return fitted_field(loaded_demonstrations(preprocessor), config)
+
+
+def loaded_demonstrations(
+    preprocessor: PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
+) -> DemonstratedActions:
+    """The demonstrated actions that a guided policy's preprocessor holds.
+
+    Args:
+        preprocessor: The preprocessor.
+
+    Raises:
+        ValueError: If it has no step that holds them.
+    """
     for step in preprocessor.steps:
         if isinstance(step, PotentialFieldProcessorStep):
-            return fitted_field(step.demonstrations, config)
+            return step.demonstrations
     raise ValueError(
         "guidance needs the potential field, got a preprocessor without its step: it belongs to another policy"
     )

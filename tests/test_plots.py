@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from torch import Tensor
 
 from lerobot_pf2mp import figures
 from lerobot_pf2mp.envs.box import Box
+from lerobot_pf2mp.field_report.report import DimensionShare, EpisodeSupport, FieldReport
 from lerobot_pf2mp.figures import THEMES, Path2D, PathPair, Scene
 from lerobot_pf2mp.figures.space import faces
 from lerobot_pf2mp.potential_field import PotentialField, fit
@@ -338,3 +340,85 @@ def test_the_flow_moves_from_noise_to_paths(tmp_path: Path) -> None:
     halves = frames[-1][height // 4 :, : width // 2 - 10], frames[-1][height // 4 :, -(width // 2 - 10) :]
     assert np.abs(halves[0].mean() - halves[1].mean()) < 0.01
     assert np.abs(frames[0] - frames[-1]).max() > 0.2
+
+
+# Support
+
+
+def report_of(n_episodes: int, names: tuple[str, ...] = ("x", "y")) -> FieldReport:
+    """A report in which the last episode is alone, and its worst action is far outside."""
+    episodes = [EpisodeSupport(i, 40, 0.01 * (i % 3), 5.0 - i % 7) for i in range(n_episodes - 1)]
+    episodes.append(EpisodeSupport(n_episodes - 1, 40, 0.8, -float("inf")))
+    shares = [1 / len(names)] * len(names)
+    kinds = ["constant", *["continuous"] * (len(names) - 1)]
+    return FieldReport(
+        source="a test",
+        bandwidth=0.1,
+        log_threshold=-3.0,
+        threshold_quantile=0.01,
+        reach=0.2,
+        spread=0.5,
+        n_frames=40 * n_episodes,
+        n_anchors=100,
+        effective_anchors=(1.0, 2.0, 3.0),
+        episodes=tuple(episodes),
+        outlying=(),
+        dimensions=tuple(map(DimensionShare, range(len(names)), names, shares, kinds)),
+        remark="",
+        action_kind=None,
+        is_enough=True,
+        verdict="Enough.",
+    )
+
+
+@pytest.mark.parametrize("background", THEMES)
+def test_a_few_episodes_get_a_bar_each_and_the_alone_one_another_colour(
+    background: str, tmp_path: Path, drawn: list[Figure]
+) -> None:
+    report = report_of(5)
+    figures.plot_support(tmp_path / "support.png", report=report, background=background)
+    left, right = drawn[0].axes
+    assert [bar.get_height() for bar in left.patches] == pytest.approx([0, 1, 2, 0, 80])
+    assert [bar.get_height() for bar in right.patches] == [5, 4, 3, 2, -20]
+    assert (left.get_ylabel(), left.get_xlabel()) == ("actions outside the safe set [%]", "episode")
+    assert right.get_ylabel() == "smallest support [nats, cut at 20]"
+    for axis in (left, right):
+        assert [label.get_text() for label in axis.get_xticklabels()] == ["0", "1", "2", "3", "4"]
+        colours = [bar.get_facecolor() for bar in axis.patches]
+        assert colours[-1][:3] == to_rgb(figures.COLLISION)
+        assert len(set(colours[:-1])) == 1
+    assert image.imread(tmp_path / "support.png").shape[1] == 900
+
+
+def test_thousands_of_episodes_are_drawn_as_a_curve_with_the_worst_first(
+    tmp_path: Path, drawn: list[Figure]
+) -> None:
+    figures.plot_support(tmp_path / "support.png", report=report_of(4000))
+    left, right = drawn[0].axes
+    for axis, worst in ((left, 80), (right, -20)):
+        assert not axis.patches
+        curve, alone = axis.lines[:2]
+        assert axis.get_xscale() == "log"
+        assert len(curve.get_xdata()) == 4000
+        assert (curve.get_xdata()[0], curve.get_ydata()[0]) == (1, worst)
+        assert list(alone.get_xdata()) == [1]
+    assert list(left.lines[0].get_ydata()) == sorted(left.lines[0].get_ydata(), reverse=True)
+    assert list(right.lines[0].get_ydata()) == sorted(right.lines[0].get_ydata())
+
+
+@pytest.mark.parametrize("n_episodes", [1, 12, 21, 40])
+def test_the_numbers_of_episodes_do_not_overlap(n_episodes: int, tmp_path: Path, drawn: list[Figure]) -> None:
+    figures.plot_support(tmp_path / "support.png", report=report_of(n_episodes))
+    for axis in drawn[0].axes:
+        boxes = [label.get_window_extent() for label in axis.get_xticklabels() if label.get_text()]
+        assert all(left.x1 < right.x0 for left, right in pairwise(boxes))
+
+
+def test_dimensions_are_drawn_with_their_names_and_shares(tmp_path: Path, drawn: list[Figure]) -> None:
+    names = ("$x", "joint_with_quite_a_long_name.pos", "grip_per$", "y")
+    figures.plot_dimensions(tmp_path / "dimensions.png", report=report_of(5, names))
+    (axis,) = drawn[0].axes
+    assert [label.get_text() for label in axis.get_yticklabels()] == list(names)
+    assert [bar.get_width() for bar in axis.patches] == [25] * 4
+    assert [text.get_text() for text in axis.texts] == ["25 % constant", *["25 %"] * 3]
+    assert all(text.get_window_extent().x1 < axis.bbox.x1 for text in axis.texts)

@@ -5,8 +5,12 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from lerobot_pf2mp.commands.command import given
+
+if TYPE_CHECKING:
+    from lerobot_pf2mp.field_report.report import FieldReport
 
 
 @dataclass
@@ -53,11 +57,15 @@ class FitFieldConfig:
 
     A pf2mp or dppf policy gets a new field. The new checkpoint works with lerobot-eval, lerobot-train and lerobot-rollout.
 
+    --report=FOLDER writes a page about the field: whether there are enough demonstrations, which of them are alone, wrong
+    values. It needs a dataset only; without --output_dir no checkpoint is written.
+
     Examples:
         pf2mp-fit-field --policy.path=outputs/diffusion/checkpoints/last/pretrained_model \
 --dataset.repo_id=you/your_dataset --output_dir=outputs/dppf
         pf2mp-fit-field --policy.path=you/your_fmp --policy.n_field_points=10000 --dataset.repo_id=you/your_dataset \
 --output_dir=outputs/pf2mp
+        pf2mp-fit-field --dataset.repo_id=you/your_dataset --report=reports/your_dataset
     """
 
     # The policy that gets a field.
@@ -66,30 +74,70 @@ class FitFieldConfig:
     dataset: FitFieldDatasetConfig = field(default_factory=FitFieldDatasetConfig)
     # Folder of the new checkpoint.
     output_dir: Path | None = None
-    # Whether to replace an existing checkpoint.
+    # Folder of a new report: report.html, report.json and figures.
+    report: Path | None = None
+    # Whether to replace an existing checkpoint and report.
     overwrite: bool = False
 
 
 def main(config: FitFieldConfig) -> None:
     """Runs the command."""
     policy, dataset = config.policy, config.dataset
-    path = given("--policy.path", policy.path)
-    repo_id = given("--dataset.repo_id", dataset.repo_id)
-    output_dir = given("--output_dir", config.output_dir)
+    path = policy.path
+    if config.report is None or config.output_dir is not None:
+        path = given("--policy.path", path)
+    options = {name: value for name, value in asdict(policy).items() if value is not None}
+    options.pop("path", None)
+    chosen: dict[str, Any] = {
+        "repo_id": given("--dataset.repo_id", dataset.repo_id),
+        "root": dataset.root and dataset.root.expanduser(),
+        "episodes": dataset.episodes,
+        "dataset_revision": dataset.revision,
+        "checkpoint_revision": options.pop("revision", None),
+        "options": options,
+    }
+    if path is None:
+        of_policy = [f"--policy.{name}" for name in options if name.startswith("guidance_")]
+        if chosen["checkpoint_revision"] is not None:
+            of_policy.append("--policy.revision")
+        if of_policy:
+            raise ValueError(
+                f"{', '.join(of_policy)} must come with --policy.path, got a report on a dataset alone"
+            )
+    else:
+        folder = Path(path).expanduser()
+        chosen["checkpoint"] = folder if folder.is_dir() else path
+    if config.report is None:
+        _write_checkpoint(given("--output_dir", config.output_dir), chosen, config.overwrite)
+    else:
+        _write_report(config.report.expanduser(), config.output_dir, chosen, config.overwrite)
+
+
+def _write_checkpoint(output_dir: Path, chosen: dict[str, Any], overwrite: bool, **options: Any) -> None:
     from lerobot_pf2mp.fit_field import fit_field
 
-    changed = {name: value for name, value in asdict(policy).items() if value is not None}
-    del changed["path"]
-    revision = changed.pop("revision", None)
-    fitted = fit_field(
-        Path(path).expanduser() if Path(path).expanduser().is_dir() else path,
-        output_dir.expanduser(),
-        repo_id=repo_id,
-        root=dataset.root and dataset.root.expanduser(),
-        episodes=dataset.episodes,
-        dataset_revision=dataset.revision,
-        checkpoint_revision=revision,
-        options=changed,
-        overwrite=config.overwrite,
-    )
+    fitted = fit_field(output_dir=output_dir.expanduser(), overwrite=overwrite, **chosen, **options)
     print(f"Wrote a {fitted.type} checkpoint to {output_dir}.")
+
+
+def _write_report(report: Path, output_dir: Path | None, chosen: dict[str, Any], overwrite: bool) -> None:
+    if output_dir is not None:
+        folders = [folder.expanduser().absolute() for folder in (report, output_dir)]
+        if folders[0] in (folders[1], *folders[1].parents) or folders[1] in folders[0].parents:
+            raise ValueError(f"--report must lie beside --output_dir, got {report} and {output_dir}")
+    from lerobot_pf2mp.figures.report_page import REPORT_MARK, write_report
+    from lerobot_pf2mp.fit_field import examine_dataset
+    from lerobot_pf2mp.process.atomic_files import written_beside
+
+    verdicts = []
+    with written_beside(report, overwrite, kind="report", mark=REPORT_MARK, option="--report") as folder:
+
+        def write(numbers: FieldReport) -> None:
+            verdicts.append(numbers.verdict)
+            write_report(numbers, folder)
+
+        if output_dir is None:
+            write(examine_dataset(**chosen))
+        else:
+            _write_checkpoint(output_dir, chosen, overwrite, report=write)
+    print(f"{verdicts[0]}\nWrote {report / 'report.html'}.")

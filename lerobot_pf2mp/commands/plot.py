@@ -20,7 +20,8 @@ class PlotConfig:
     lambda: collision and success rate against lambda, from --results. density, arrows: the potential field of
     --checkpoint. trajectories: episodes without and with guidance, from the same start and noise. overview: all of these
     for a maze. strokes: all strokes of --n_episodes episodes, without and with guidance. flow: an animation (GIF) of
-    chunks that move from noise to trajectories. video: one episode without and with guidance, side by side (MP4).
+    chunks that move from noise to trajectories. video: one episode without and with guidance, side by side (MP4). support:
+    how each demonstrated episode of --checkpoint lies in the safe set of the others.
 
     Examples:
         pf2mp-plot --figure=lambda --results=[results/maze_lambda] --task=MazeLarge-v0 --output=lambda.png
@@ -31,7 +32,7 @@ class PlotConfig:
         pf2mp-plot --figure=flow --checkpoint=you/your_pf2mp --options='{num_inference_steps: 20}' --output=flow.gif
     """
 
-    # lambda, density, arrows, trajectories, overview, strokes, flow or video.
+    # lambda, density, arrows, trajectories, overview, strokes, flow, video or support.
     figure: str = "overview"
     # The file to write: PNG, GIF for flow, MP4 for video.
     output: Path | None = None
@@ -58,7 +59,12 @@ class PlotConfig:
 def main(config: PlotConfig) -> None:
     """Runs the command."""
     from lerobot_pf2mp import figures
-    from lerobot_pf2mp.figures.policy_figures import FIGURES, GuidedPolicyFigures, make_lambda_figure
+    from lerobot_pf2mp.figures.policy_figures import (
+        FIGURES,
+        GuidedPolicyFigures,
+        make_lambda_figure,
+        make_support_figure,
+    )
 
     for option, value, choices in (
         ("--figure", config.figure, FIGURES),
@@ -79,6 +85,9 @@ def main(config: PlotConfig) -> None:
             raise ValueError("--results must name folders written by pf2mp-benchmark, got none")
         results = [path.expanduser() for path in config.results]
         make_lambda_figure(results, output, task=config.task, background=config.background)
+    elif config.figure == "support":
+        checkpoint = given("--checkpoint", config.checkpoint)
+        make_support_figure(checkpoint, output, options=config.options, background=config.background)
     else:
         checkpoint = given("--checkpoint", config.checkpoint)
         of_policy = GuidedPolicyFigures(checkpoint, config.env, seed=config.seed, options=config.options)

@@ -47,18 +47,16 @@ def report_on_dataset(
 def _read(dataset: LeRobotDataset, normalise: Callable[[Tensor], Tensor]) -> Frames:
     table = dataset.hf_dataset.with_format("numpy", columns=[ACTION, "index", "episode_index"])
     stride = -(-len(table) // _MOST_FRAMES)
-    starts = range(0, len(table), _FRAMES_AT_ONCE * stride)
+    starts = range(0, len(table), _FRAMES_AT_ONCE)
     parts = []
     for start in tqdm(starts, desc="Judging actions", unit="block", disable=len(starts) < 2):
-        block = table[start : start + _FRAMES_AT_ONCE * stride : stride]
-        actions = torch.from_numpy(np.array(block[ACTION], dtype=np.float32)).reshape(len(block["index"]), -1)
-        parts.append(
-            (
-                normalise(actions),
-                torch.from_numpy(np.asarray(block["episode_index"])).reshape(-1).long(),
-                torch.from_numpy(np.asarray(block["index"])).reshape(-1).long(),
-            )
+        block = table[start : start + _FRAMES_AT_ONCE]
+        n_rows = len(block["index"])
+        actions, episodes, numbers = (
+            torch.from_numpy(np.array(block[key], dtype=dtype)).reshape(n_rows, -1)[-start % stride :: stride]
+            for key, dtype in ((ACTION, np.float32), ("episode_index", np.int64), ("index", np.int64))
         )
+        parts.append((normalise(actions), episodes.flatten(), numbers.flatten()))
     actions, episodes, numbers = (torch.cat(columns) for columns in zip(*parts, strict=True))
     return Frames(actions, episodes, numbers)
 

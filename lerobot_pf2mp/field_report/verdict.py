@@ -84,4 +84,4 @@ def _are(episodes: Sequence[EpisodeSupport]) -> str:
 
 
 def _percent(share: float) -> str:
-    return f"{100 * share:.3g} %"
+    return f"{100 * share:.1f}".removesuffix(".0") + " %"

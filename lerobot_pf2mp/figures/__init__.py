@@ -11,6 +11,7 @@ from lerobot_pf2mp.figures.paths import Path2D, PathPair
 from lerobot_pf2mp.figures.rates import plot_lambda
 from lerobot_pf2mp.figures.scene import Scene
 from lerobot_pf2mp.figures.strokes import plot_strokes
+from lerobot_pf2mp.figures.support import plot_dimensions, plot_support
 from lerobot_pf2mp.figures.theme import ANCHOR, COLLISION, EULER, GOAL, GUIDED, START, THEMES, Theme
 from lerobot_pf2mp.figures.trajectories import plot_trajectories
 
@@ -29,8 +30,10 @@ __all__ = [
     "animate_flow",
     "plot_arrows",
     "plot_density",
+    "plot_dimensions",
     "plot_lambda",
     "plot_maze_overview",
     "plot_strokes",
+    "plot_support",
     "plot_trajectories",
 ]

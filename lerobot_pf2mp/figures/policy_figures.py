@@ -26,15 +26,17 @@ from lerobot_pf2mp.envs.configs.handwriting import PF2MPHandwritingEnv
 from lerobot_pf2mp.envs.configs.maze import PF2MPMazeEnv
 from lerobot_pf2mp.envs.maze.point_maze import parse_maze_map
 from lerobot_pf2mp.envs.tasks import MAZE_TASKS
+from lerobot_pf2mp.field_report.examination import make_field_report
 from lerobot_pf2mp.figures import Path2D, PathPair, Scene
 from lerobot_pf2mp.figures.comparison_video import write_comparison
-from lerobot_pf2mp.loading import load_policy
+from lerobot_pf2mp.figures.support import plot_support
+from lerobot_pf2mp.loading import load_policy, loaded_demonstrations
 from lerobot_pf2mp.policies.batch_keys import POTENTIAL_FIELD
 from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
 from lerobot_pf2mp.results.rows import SummaryRow, read_rows
 from lerobot_pf2mp.results.summary import group_cells
 
-FIGURES = ("lambda", "density", "arrows", "trajectories", "overview", "strokes", "flow", "video")
+FIGURES = ("lambda", "density", "arrows", "trajectories", "overview", "strokes", "flow", "video", "support")
 
 _N_SEARCHED = 100  # episodes among which the clearest ones are chosen
 
@@ -58,6 +60,28 @@ def make_lambda_figure(results: Sequence[Path], output: Path, *, task: str | Non
     figures.plot_lambda(
         output, cells=group_cells(row for row in rows if task in (None, row.task)), background=background
     )
+
+
+def make_support_figure(
+    checkpoint: str | Path, output: Path, *, options: dict[str, Any] | None = None, background: str
+) -> None:
+    """Draws the support of the demonstrations that a checkpoint holds. It needs no environment and no dataset.
+
+    Args:
+        checkpoint: A pf2mp or dppf checkpoint.
+        output: The PNG file to write.
+        options: Changes to the policy's configuration.
+        background: light or dark.
+
+    Raises:
+        ValueError: If the policy has no potential field.
+    """
+    policy, preprocessor, _ = load_policy(checkpoint, device="cpu", **(options or {}))
+    config: Any = policy.config
+    report = make_field_report(
+        loaded_demonstrations(preprocessor), source=f"checkpoint {checkpoint}", settings=config.field_settings
+    )
+    plot_support(output, report=report, background=background)
 
 
 class GuidedPolicyFigures:
@@ -90,7 +114,7 @@ class GuidedPolicyFigures:
     def draw(
         self, figure: str, output: Path, n_episodes: int, episodes: Sequence[int], background: str
     ) -> None:
-        """Writes one of `FIGURES` except lambda.
+        """Writes one of `FIGURES` except lambda and support.
 
         Args:
             figure: Its name.
