@@ -69,7 +69,9 @@ def main(config: GlitchesConfig) -> None:
     print((config.output_dir / "table.md").read_text(encoding="utf-8"))
 
 
-def write_checkpoint(config: GlitchesConfig, folder: Path, share: float, size: float, leave_out: str) -> float:
+def write_checkpoint(
+    config: GlitchesConfig, folder: Path, share: float, size: float, leave_out: str
+) -> float:
     """Writes the checkpoint with a field fitted anew to actions of which a share is wrong; returns its bandwidth h."""
     _, preprocessor, _ = load_policy(config.checkpoint, device="cpu")
     shutil.copytree(config.checkpoint, folder)

@@ -91,7 +91,7 @@ def read_symbols(path: Path) -> tuple[Tensor, Tensor]:
 def read_joints(path: Path) -> tuple[Tensor, Tensor]:
     """Joint positions of a Panda, one recording, in twenty successive parts."""
     with path.open(newline="") as file:
-        rows = [row for row in csv.DictReader((line for line in file if line.strip()), delimiter=";")]
+        rows = list(csv.DictReader((line for line in file if line.strip()), delimiter=";"))
     joints = torch.tensor([[float(row[f"joint_{i}"]) for i in range(1, 8)] for row in rows])
     joints = joints[(joints != 0).any(dim=1)]
     return joints, torch.arange(len(joints)) * 20 // len(joints)
@@ -107,10 +107,13 @@ def read_drawings(path: Path, number: int) -> tuple[Tensor, Tensor]:
         drawings = characters[sorted(characters)[number]]
         texts = [archive.read(name).decode() for name in drawings]
     points = [
-        [[float(x) for x in line.split(",")[:2]] for line in text.splitlines() if "," in line] for text in texts
+        [[float(x) for x in line.split(",")[:2]] for line in text.splitlines() if "," in line]
+        for text in texts
     ]
     counts = torch.tensor([len(one) for one in points])
-    return torch.cat([torch.tensor(one) for one in points]), torch.arange(len(points)).repeat_interleave(counts)
+    return torch.cat([torch.tensor(one) for one in points]), torch.arange(len(points)).repeat_interleave(
+        counts
+    )
 
 
 def measure(name: str, actions: Tensor, episodes: Tensor, quantile: float) -> dict:
@@ -148,7 +151,7 @@ def measure(name: str, actions: Tensor, episodes: Tensor, quantile: float) -> di
 def make_table(rows: list[dict]) -> str:
     """The rows as a Markdown table."""
     lines = [
-        "| demonstrations | dimensions | episodes | outside, before [%] | outside, now [%] | parts, now [%] | h before | h now |",
+        "| demonstrations | dimensions | episodes | outside before [%] | outside now [%] | parts now [%] | h before | h now |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
