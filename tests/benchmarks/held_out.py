@@ -151,7 +151,7 @@ def measure(name: str, actions: Tensor, episodes: Tensor, quantile: float) -> di
 def make_table(rows: list[dict]) -> str:
     """The rows as a Markdown table."""
     lines = [
-        "| demonstrations | dimensions | episodes | outside before [%] | outside now [%] | parts now [%] | h before | h now |",
+        "| demonstrations | dimensions | episodes | outside before [%] | outside now [%] | parts [%] | h before | h now |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
