@@ -7,13 +7,13 @@ import re
 
 import pytest
 import torch
+from demonstrated_paths import paths
 
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
 from lerobot_pf2mp.policies.guided.field_settings import FieldSettings
 from lerobot_pf2mp.policies.guided.frame_ranks import frame_of, rank_of
 from lerobot_pf2mp.policies.guided.recorded_angles import JUMP, LEAP, steps_seen
 from lerobot_pf2mp.potential_field import fit
-from demonstrated_paths import paths
 
 
 def recorded(n_episodes=10, n_frames=40, dim=2):

@@ -31,10 +31,16 @@ class FitFieldPolicyConfig:
     field_action_dims: tuple[int, ...] | None = None
     # Kernel bandwidth [normalised action units], or likelihood, scott or silverman.
     field_bandwidth: float | str | None = None
-    # Quantile of the anchors' own densities above which an action counts as safe.
+    # Quantile of the demonstrated actions' densities above which an action counts as safe.
     field_threshold_quantile: float | None = None
     # Weight of the distance to the safe set, at most 0.
     field_alpha: float | None = None
+    # What is left out of the density where it judges its own actions: episode, or nothing (the rule of before).
+    field_leave_out: str | None = None
+    # Action dimensions that are angles; by default those in which recorded actions jump by a period.
+    field_angle_dims: tuple[int, ...] | None = None
+    # Period of the angles in the dataset's units [rad; 360 for degrees].
+    field_angle_period: float | None = None
 
 
 @dataclass
