@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from forked_commands import run_well
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
@@ -217,6 +218,20 @@ def test_only_the_main_process_looks_and_warns(data, caplog, monkeypatch):
     monkeypatch.setattr("torch.distributed.get_rank", lambda: 1)
     train_a_step_on(dataset_of(data["displacements"]))
     assert warnings_in(caplog) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["lerobot-train", "pf2mp-train"])
+@pytest.mark.parametrize("name", ["positions", "displacements"])
+def test_the_training_commands_warn_once(command, name, data, tmp_path):
+    said = run_well(
+        *(command, f"--dataset.repo_id=local/{name}", f"--dataset.root={data[name]}"),
+        *("--policy.type=pf2mp", "--policy.push_to_hub=false", "--policy.device=cpu", "--policy.horizon=8"),
+        *("--policy.n_action_steps=8", "--policy.down_dims=[8,16]", "--policy.diffusion_step_embed_dim=16"),
+        *("--batch_size=4", "--num_workers=0", "--steps=3", "--save_checkpoint=false"),
+        f"--output_dir={tmp_path / 'run'}",
+    )
+    assert said.count(NO_POSITIONS) == (name == "displacements")
 
 
 @pytest.mark.parametrize("name", ["positions", "displacements"])

@@ -43,8 +43,13 @@ def judge_demonstrations(
         spread: Spread of the actions [normalised].
 
     Returns:
-        Whether they are enough, None if it cannot be told from a single episode, and the sentence.
+        Whether they are enough, None if it cannot be told from one episode or unknown ones, and the sentence.
     """
+    if any(episode.episode is None for episode in episodes):
+        return None, (
+            "Whether the demonstrations are enough cannot be told: the field does not know which episodes its actions are of; "
+            "pf2mp-fit-field makes one that does."
+        )
     if len(episodes) < 2:
         return None, "Whether the demonstrations are enough cannot be told from one episode: record several."
     alone = [e for e in episodes if e.outside_share > _ALONE and e.n_actions >= _FEWEST_ACTIONS]

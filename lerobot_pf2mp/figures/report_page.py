@@ -11,7 +11,7 @@ from pathlib import Path
 
 from lerobot_pf2mp import __version__
 from lerobot_pf2mp.field_report.report import FieldReport
-from lerobot_pf2mp.figures.support import plot_dimensions, plot_support
+from lerobot_pf2mp.figures.support import count_of_episodes, plot_dimensions, plot_support
 from lerobot_pf2mp.figures.theme import THEMES
 
 # A folder with this file is a report.
@@ -107,7 +107,7 @@ def _numbers(report: FieldReport) -> str:
             f"{report.reach:.3g}",
             f"of the safe set from an action that is far from all others{share}",
         ),
-        ("Frames", f"{report.n_frames}", f"looked at, of {len(report.episodes)} episodes"),
+        ("Frames", f"{report.n_frames}", f"looked at, of {count_of_episodes(report)}"),
         ("Anchors", f"{report.n_anchors}", "demonstrated actions that make up the field"),
         (
             "Anchors that count",

@@ -44,9 +44,18 @@ def plot_support(output: Path, *, report: FieldReport, background: str = "light"
         _draw_episodes(right, report.episodes, supports, [-value for value in supports], theme)
         right.axhline(0, color=theme.text, linestyle="--", linewidth=1)
         cut = f", cut at {_SUPPORT_RANGE:.0f}" if is_cut else ""
-        right.set(ylabel=f"smallest support [nats{cut}]")
+        ends = 1.05 * min(supports, default=0.0), 1.05 * max(supports, default=0.0)
+        right.set(ylabel=f"smallest support [nats{cut}]", ylim=(min(ends[0], -1.0), max(ends[1], 1.0)))
         right.set_title("Worst action (dashed: border of the safe set)", fontsize=11)
-        figure.suptitle(f"{len(report.episodes)} episodes, each judged by the others", fontsize=12)
+        judged = "each judged by the others" if len(supports) > 1 else "judged by its other frames"
+        figure.suptitle(f"{count_of_episodes(report)}, {judged}", fontsize=12)
+
+
+def count_of_episodes(report: FieldReport) -> str:
+    """The number of episodes, in words."""
+    if any(episode.episode is None for episode in report.episodes):
+        return "unknown episodes"
+    return f"{len(report.episodes)} episode{'' if len(report.episodes) == 1 else 's'}"
 
 
 def plot_dimensions(output: Path, *, report: FieldReport, background: str = "light") -> None:
@@ -93,7 +102,8 @@ def _draw_episodes(
         axis.set_xticks(range(0, len(labels), step), labels[::step])
         if len(labels) > 12:
             axis.tick_params(axis="x", labelsize=8)
-        axis.set(xlabel="episode")
+        margin = 0.6 + max(0, 6 - len(values)) / 2
+        axis.set(xlabel="episode", xlim=(-margin, len(values) - 1 + margin))
     else:
         order = np.argsort(badness, kind="stable")[::-1]
         rank = np.arange(1, len(values) + 1)
