@@ -47,7 +47,7 @@ def judge_demonstrations(
     """
     if any(episode.episode is None for episode in episodes):
         return None, (
-            "Whether the demonstrations are enough cannot be told: the field does not know which episodes its actions are of; "
+            "Whether the demonstrations are enough cannot be told: the field does not know the episodes of its actions; "
             "pf2mp-fit-field makes one that does."
         )
     if len(episodes) < 2:
