@@ -47,8 +47,8 @@ def judge_demonstrations(
     """
     if any(episode.episode is None for episode in episodes):
         return None, (
-            "Whether the demonstrations are enough cannot be told: the field does not know which episodes its actions are of; "
-            "pf2mp-fit-field makes one that does."
+            "Whether the demonstrations are enough cannot be told: the field does not know which episodes its actions are "
+            "of; pf2mp-fit-field makes one that does."
         )
     if len(episodes) < 2:
         return None, "Whether the demonstrations are enough cannot be told from one episode: record several."
