@@ -16,7 +16,6 @@ import json
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import draccus
 import torch
@@ -40,6 +39,8 @@ class GlitchesConfig:
     checkpoint: Path = Path("outputs/MazeLarge-v0/pf2mp_0/checkpoints/last/pretrained_model")
     # Folder of the results.
     output_dir: Path = Path("results/ablations/glitches")
+    # Folder for the checkpoints with the wrong values.
+    work_dir: Path = Path("outputs/glitches")
     task: str = "MazeLarge-v0"
     n_episodes: int = 500
     n_processes: int = 2
@@ -48,24 +49,23 @@ class GlitchesConfig:
 
 def main(config: GlitchesConfig) -> None:
     """Makes the fields and evaluates them."""
-    with TemporaryDirectory() as name:
-        policies = {}
-        for share, size in tqdm(CASES, desc="Fields", unit="case"):
-            for rule, leave_out in RULES.items():
-                case = f"{100 * share:g} % of size {size:g}, {rule}" if share else f"clean, {rule}"
-                folder = Path(name) / f"{share}_{size}_{rule}"
-                h = write_checkpoint(config, folder, share, size, leave_out)
-                policies[f"{case}, h = {h:.4f}"] = str(folder)
-        spec = BenchmarkSpec(
-            env=PF2MPMazeEnv(task=config.task),
-            tasks=(config.task,),
-            policies=policies,
-            guidances=tuple(Guidance.parse("proximal:0.8")),
-            seeds=(0,),
-            n_repeats=1,
-            n_episodes=config.n_episodes,
-        )
-        run_benchmark(spec, config.output_dir, n_processes=config.n_processes)
+    policies = {}
+    for share, size in tqdm(CASES, desc="Fields", unit="case"):
+        for rule, leave_out in RULES.items():
+            case = f"{100 * share:g} % of size {size:g}, {rule}" if share else f"clean, {rule}"
+            folder = config.work_dir / f"{share}_{size}_{rule}"
+            h = write_checkpoint(config, folder, share, size, leave_out)
+            policies[f"{case}, h = {h:.4f}"] = str(folder)
+    spec = BenchmarkSpec(
+        env=PF2MPMazeEnv(task=config.task),
+        tasks=(config.task,),
+        policies=policies,
+        guidances=tuple(Guidance.parse("proximal:0.8")),
+        seeds=(0,),
+        n_repeats=1,
+        n_episodes=config.n_episodes,
+    )
+    run_benchmark(spec, config.output_dir, n_processes=config.n_processes)
     print((config.output_dir / "table.md").read_text(encoding="utf-8"))
 
 
@@ -74,7 +74,7 @@ def write_checkpoint(
 ) -> float:
     """Writes the checkpoint with a field fitted anew to actions of which a share is wrong; returns its bandwidth h."""
     _, preprocessor, _ = load_policy(config.checkpoint, device="cpu")
-    shutil.copytree(config.checkpoint, folder)
+    shutil.copytree(config.checkpoint, folder, dirs_exist_ok=True)
     step = next(step for step in preprocessor.steps if isinstance(step, PotentialFieldProcessorStep))
     demonstrations = step.demonstrations
     generator = torch.Generator().manual_seed(config.seed)
