@@ -32,7 +32,7 @@ class PlotConfig:
         pf2mp-plot --figure=flow --checkpoint=you/your_pf2mp --options='{num_inference_steps: 20}' --output=flow.gif
     """
 
-    # lambda, density, arrows, trajectories, overview, strokes, flow, video or support.
+    # lambda, density, arrows, trajectories, overview, strokes, flow or video; or support.
     figure: str = "overview"
     # The file to write: PNG, GIF for flow, MP4 for video.
     output: Path | None = None

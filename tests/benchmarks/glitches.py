@@ -61,6 +61,7 @@ def main(config: GlitchesConfig) -> None:
         tasks=(config.task,),
         policies=policies,
         guidances=tuple(Guidance.parse("proximal:0.8")),
+        variants={"": {}},
         seeds=(0,),
         n_repeats=1,
         n_episodes=config.n_episodes,

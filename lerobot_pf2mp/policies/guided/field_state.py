@@ -78,6 +78,9 @@ class FieldState:
             "steps": torch.empty(0, dtype=torch.uint8),
             "role": torch.full((len(points),), ANCHOR, dtype=torch.uint8),
         }
+        if len(tensors.get("unit", ())) not in (0, points.shape[1]):
+            # Points of other dimensions than the policy's. The policy says so where it needs the field.
+            tensors = {name: value for name, value in tensors.items() if name not in ("unit", "steps")}
         state = cls(**{name: {**defaults, **tensors}[name] for name in wanted | added})
         state._check_added()
         return state
