@@ -87,6 +87,7 @@ def write_checkpoint(
     points[wrong, coordinate] = sign * size
     demonstrations.load_state_dict({**state, "points": points})
     demonstrations.settings = replace(demonstrations.settings, leave_out=leave_out)
+    demonstrations._fitted = None  # the state holds the field of the right values
     preprocessor.save_pretrained(folder)
     written = json.loads((folder / "config.json").read_text(encoding="utf-8"))
     written["field_leave_out"] = leave_out
