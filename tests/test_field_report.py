@@ -70,7 +70,7 @@ ENOUGH, TOO_FEW = "The demonstrations are enough", "More demonstrations are need
         (supports(0.0, 0.02, 0.01), 0.1, True, f"{ENOUGH}: 1 % of .* no demonstration is alone"),
         (supports(0.3), 0.1, None, "cannot be told from one episode"),
         ([], 0.1, None, "cannot be told from one episode"),
-        ([EpisodeSupport(None, 50, 0.0, 1.0)], 0.1, None, "the field does not know which episodes"),
+        ([EpisodeSupport(None, 50, 0.0, 1.0)], 0.1, None, "the field does not know the episodes"),
         (supports(0.0, 0.9, 0.0, 0.0), 0.1, False, "^Episode 1 of 4 is alone"),
         (supports(*[0.0] * 20, 0.9, 0.8, 0.7), 0.1, False, "^Episodes 20, 21 and 22 of 23 are alone"),
         (supports(*[0.0] * 20, *[0.9] * 8), 0.1, False, "^Episodes 20, 21, 22, 23, 24, 25 and 2 more of 28"),
