@@ -19,7 +19,7 @@ from lerobot.lerobot_types import TransitionKey
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
 from lerobot.processor import DeviceProcessorStep, NormalizerProcessorStep, PolicyProcessorPipeline
-from lerobot.utils.constants import ACTION
+from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 from tqdm import tqdm
 
@@ -28,11 +28,13 @@ from lerobot_pf2mp.field_report.of_dataset import report_on_dataset
 from lerobot_pf2mp.field_report.report import FieldReport
 from lerobot_pf2mp.loading import load_config
 from lerobot_pf2mp.policies.guided.action_kind import warn_unless_positions
-from lerobot_pf2mp.policies.guided.action_units import normalised_unit, normaliser_of
+from lerobot_pf2mp.policies.guided.action_units import normalised_unit, normaliser_of, places_of_states
 from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
+from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
 from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
 from lerobot_pf2mp.policies.guided.relative_actions import refuse_relative_actions
 from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
+from lerobot_pf2mp.policies.plans.demonstrated_plans import choose_plans_of_episodes
 from lerobot_pf2mp.process.atomic_files import written_beside
 
 GUIDED_TYPES = {"fmp": "pf2mp", "pf2mp": "pf2mp", "diffusion": "dppf", "dppf": "dppf"}
@@ -220,10 +222,10 @@ def _fitted_step(
         raise ValueError(f"the dataset's action must have the policy's shape {tuple(wanted)}, got {shape}")
     settings = cast(GuidedConfig, config).field_settings
     step = PotentialFieldProcessorStep(**asdict(settings))
-    unit = torch.ones(shape)
+    unit, places = torch.ones(shape), torch.empty(0, 0)
     for normaliser in steps:
         if isinstance(normaliser, NormalizerProcessorStep):
-            unit = normalised_unit(normaliser, *shape)
+            unit, places = normalised_unit(normaliser, *shape), places_of_states(normaliser, *shape)
     frames = dataset.hf_dataset.with_format("numpy", columns=[ACTION, "index", "episode_index"])
     starts = range(0, len(frames), _FRAMES_AT_ONCE)
     for start in tqdm(starts, desc="Reading actions", unit="block", disable=len(starts) < 2):
@@ -238,13 +240,58 @@ def _fitted_step(
         is_start = torch.ones(1, len(episodes), dtype=torch.bool)
         is_start[0, 1:] = episodes.diff() != 0
         step.demonstrations.recognise_angles(actions.reshape(1, -1, *shape), is_start, unit)
+    _observe_plans(step.demonstrations, config, dataset, steps, places)
     step.demonstrations.field()  # raises an error now if the dataset has no actions, not later at inference
     return step
 
 
-def _normalise(steps: Sequence[Any], actions: Tensor) -> Tensor:
-    transition: Any = {TransitionKey.ACTION: actions}
+def _observe_plans(
+    demonstrations: DemonstratedActions,
+    config: PreTrainedConfig,
+    dataset: LeRobotDataset,
+    steps: Sequence[Any],
+    places: Tensor,
+) -> None:
+    """Keeps the demonstrated plans that training on all frames would have kept."""
+    delta = torch.tensor(config.action_delta_indices)
+    numbers = dataset.hf_dataset.with_format("numpy", columns=["index", "episode_index"])[:]
+    frames, episodes = (
+        torch.from_numpy(np.array(numbers[key])).reshape(-1) for key in ("index", "episode_index")
+    )
+    chosen = choose_plans_of_episodes(episodes, frames, getattr(config, "drop_n_last_frames", 0))
+    if not len(chosen):
+        return
+    # LeRobot continues a chunk beyond its episode with copies of the first or last action.
+    _, number, counts = torch.unique_consecutive(episodes, return_inverse=True, return_counts=True)
+    ends = counts.cumsum(0)[number[chosen]] - 1
+    starts = ends + 1 - counts[number[chosen]]
+    rows = (chosen.unsqueeze(1) + delta).clamp(starts.unsqueeze(1), ends.unsqueeze(1))  # (E, T)
+    has_states = bool(places.numel())
+    columns = [ACTION, *([OBS_STATE] if has_states else [])]
+    table = dataset.hf_dataset.with_format("numpy", columns=columns)
+    read = table[rows.flatten().tolist()]
+    actions = torch.from_numpy(np.array(read[ACTION], dtype=np.float32)).unflatten(0, rows.shape)
+    states = None
+    if has_states:
+        states = torch.from_numpy(np.array(table[chosen.tolist()][OBS_STATE], dtype=np.float32))
+        states = _normalise(steps, states, OBS_STATE)
+    demonstrations.observe_plans(
+        _normalise(steps, actions)[:, -delta[0] :],
+        frames[chosen],
+        episodes[chosen],
+        states=states,
+        places=places,
+        n_executed=config.n_action_steps,
+    )
+
+
+def _normalise(steps: Sequence[Any], values: Tensor, key: str = ACTION) -> Tensor:
+    """Actions, or an observation, as the policy gets them."""
+    is_action = key == ACTION
+    transition: Any = (
+        {TransitionKey.ACTION: values} if is_action else {TransitionKey.OBSERVATION: {key: values}}
+    )
     for step in steps:
         if isinstance(step, NormalizerProcessorStep):
             transition = step(transition)
-    return transition[TransitionKey.ACTION]
+    return transition[TransitionKey.ACTION] if is_action else transition[TransitionKey.OBSERVATION][key]

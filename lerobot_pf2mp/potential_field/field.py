@@ -85,6 +85,8 @@ class PotentialField:
     alpha: float = 0.0
     periods: Tensor | None = None
     anchor_is_safe: Tensor | None = None
+    log_full_pull: float = math.inf
+    log_no_pull: float = math.inf
 
     def __post_init__(self) -> None:
         if self.anchors.ndim != 2 or self.anchors.shape[0] < 1 or self.anchors.shape[1] < 1:

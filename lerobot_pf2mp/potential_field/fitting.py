@@ -57,12 +57,14 @@ class JudgedFit:
     Args:
         field: The field. Its anchors are the points that are not outlying.
         is_outlying: ``(P,)`` bool, points far from all others, see `HeldOut.far_and_outlying`.
+        is_far: ``(P,)`` bool, points far from those of other episodes, which do not count in quantiles.
         log_density: ``(P,)`` log density of each point without its own episode [nats]; -inf if nothing else remains.
         distance: ``(P,)`` distance to the nearest point of another episode [normalised]; inf if nothing else remains.
     """
 
     field: PotentialField
     is_outlying: Tensor
+    is_far: Tensor
     log_density: Tensor
     distance: Tensor
 
@@ -157,7 +159,8 @@ def fit_judged(
     if not held_out.can_judge:  # as few as one or two points
         field = _fit_to_itself(points, periods, bandwidth, threshold_quantile, alpha)
         nothing = torch.full((len(points),), math.inf)
-        return JudgedFit(field, torch.zeros(len(points), dtype=torch.bool), -nothing, nothing)
+        none = torch.zeros(len(points), dtype=torch.bool)
+        return JudgedFit(field, none, none, -nothing, nothing)
     h = select_bandwidth(on_cpu, bandwidth, groups=groups, periods=periods)
     log_density, distance = held_out.judge(h)
     is_far, is_outlying = held_out.far_and_outlying(distance, h)
@@ -165,7 +168,7 @@ def fit_judged(
         kept = HeldOut(on_cpu[~is_outlying], groups[~is_outlying], periods)
         log_density, distance = kept.judge(h, on_cpu, groups)
     # A way that only one episode went is no measure of what is usual.
-    log_threshold = _just_below_quantile(log_density[~is_far], threshold_quantile)
+    log_threshold = just_below_quantile(log_density[~is_far], threshold_quantile)
     field = PotentialField(
         points[~is_outlying.to(points.device)],
         h,
@@ -174,7 +177,7 @@ def fit_judged(
         periods,
         (log_density[~is_outlying] > log_threshold).to(points.device),
     )
-    return JudgedFit(field, is_outlying, log_density, distance)
+    return JudgedFit(field, is_outlying, is_far, log_density, distance)
 
 
 def _fit_to_itself(
@@ -182,12 +185,12 @@ def _fit_to_itself(
 ) -> PotentialField:
     field = PotentialField(points, select_bandwidth(points, bandwidth), alpha=alpha, periods=periods)
     return replace(
-        field, log_threshold=_just_below_quantile(field.log_density(points).cpu(), threshold_quantile)
+        field, log_threshold=just_below_quantile(field.log_density(points).cpu(), threshold_quantile)
     )
 
 
-def _just_below_quantile(log_densities: Tensor, quantile: float) -> float:
-    """A number just below a quantile of finite log densities; `_TIES` says how far."""
+def just_below_quantile(log_densities: Tensor, quantile: float) -> float:
+    """A number just below a quantile of the finite ones of some log densities; `_TIES` says how far."""
     known = log_densities[log_densities.isfinite()]
     rank = max(1, math.ceil(quantile * len(known)))
     # kthvalue rather than torch.quantile, which refuses more than 2^24 elements.

@@ -9,21 +9,23 @@ from typing import Any
 
 import torch
 from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
-from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
 from lerobot_pf2mp.flow_matching import Guide
 from lerobot_pf2mp.policies.dppf.configuration_dppf import DPPFConfig
 from lerobot_pf2mp.policies.guided.field_guidance import FieldGuidance
 from lerobot_pf2mp.policies.model_card import WithModelCard
+from lerobot_pf2mp.policies.plans.plans import Plans
 from lerobot_pf2mp.policies.without_peft import WithoutPEFT
 
 
 class DPPFPolicy(WithoutPEFT, WithModelCard, DiffusionPolicy):
     """`DiffusionPolicy` with a potential field. It adds to it what `PF2MPPolicy` adds to `FMPPolicy`.
 
-    Training also adds its actions to the field, the guide changes every denoising step, and each chunk is checked. The
-    weights are those of `DiffusionPolicy`, and with ``guidance_scale=0`` so are the actions.
+    Training also adds its actions to the field, the guide changes every denoising step, and each chunk is checked, and
+    drawn again if it leaves the demonstrated region. The weights are those of `DiffusionPolicy`, and with
+    ``guidance_scale=0`` and ``max_plans=1`` so are the actions.
 
     Args:
         config: The policy's configuration.
@@ -56,21 +58,37 @@ class DPPFPolicy(WithoutPEFT, WithModelCard, DiffusionPolicy):
     def predict_action_chunk(
         self, batch: dict[str, Any], noise: Tensor | None = None, guide: Guide | None = None
     ) -> Tensor:
-        """The chunk of `DiffusionPolicy` with a guide in every denoising step. The chunk is then checked.
+        """The chunk of `DiffusionPolicy` with a guide in every denoising step, chosen among up to ``max_plans``.
 
         Args:
             batch: Normalised observations, as for `DiffusionPolicy.predict_action_chunk`, with the potential field. Without
                 past `select_action` calls, a single frame is repeated for the whole window.
-            noise: ``(B, horizon, action_dim)`` the sample to denoise; drawn from N(0, I) if None.
+            noise: ``(B, horizon, action_dim)`` the first plan's sample to denoise; drawn from N(0, I) if None.
             guide: The guide to use instead of the configured one; None for the configured one.
 
         Raises:
-            ValueError: If there is guidance, or a check, and the batch holds no field or one over other dimensions.
+            ValueError: If there is guidance, or a check that was asked for, and the batch holds no field, one over other
+                dimensions, or one without demonstrated plans; or if an action is not finite.
+            UnsupportedPlanError: With ``on_unsupported=stop``, if no plan stays in the demonstrated region.
         """
+        self.guidance.begin(None)
         guide = guide or self.guidance.guide(batch, next(self.parameters()).device)
+        window = self._with_window(batch)
         with self._guided(guide):
-            chunk = super().predict_action_chunk(self._with_window(batch), noise=noise)
-        return self.guidance.check(batch, chunk)
+            chunk = super().predict_action_chunk(window, noise=noise)
+
+        def draw_more(rows: Tensor, n: int) -> Tensor:
+            observations = self._observations_of(window, rows, n)
+            with self._guided(guide):
+                return self.diffusion.generate_actions(observations)
+
+        return self.guidance.choose(batch, chunk, draw_more)
+
+    def select_action(self, batch: dict[str, Any], *args: Any, **kwargs: Any) -> Tensor:
+        """The action of `DiffusionPolicy`, which the next plan's way begins with."""
+        action = super().select_action(batch, *args, **kwargs)
+        self.guidance.executed(action)
+        return action
 
     def reset(self) -> None:
         """Forgets past observations and planned actions. Must be called at the start of an episode."""
@@ -78,9 +96,22 @@ class DPPFPolicy(WithoutPEFT, WithModelCard, DiffusionPolicy):
         self.guidance.reset()
 
     @property
+    def plans(self) -> Plans | None:
+        """What is known of the last plans; None if they were not checked."""
+        return self.guidance.plans
+
+    @property
     def support(self) -> Tensor | None:
-        """``(B, T)`` how far the last chunk's actions are inside the demonstrated region, see `FieldGuidance.support`."""
+        """``(B, T)`` how far the last chunk's way is inside the demonstrated region, see `FieldGuidance.support`."""
         return self.guidance.support
+
+    def _observations_of(self, window: dict[str, Any], rows: Tensor, n: int) -> dict[str, Tensor]:
+        """The observations that the network sees of some robots ``(F,)``, each n times, from queues or window."""
+        seen = {**window, **{key: torch.stack(list(q), dim=1) for key, q in self._queues.items() if q}}
+        if self.config.image_features and OBS_IMAGES not in seen:
+            seen[OBS_IMAGES] = torch.stack([seen[key] for key in self.config.image_features], dim=-4)
+        keys = [key for key in (OBS_STATE, OBS_ENV_STATE, OBS_IMAGES) if key in seen]
+        return {key: seen[key][rows].repeat_interleave(n, dim=0) for key in keys}
 
     def _with_window(self, batch: dict[str, Any]) -> dict[str, Any]:
         if any(self._queues.values()):

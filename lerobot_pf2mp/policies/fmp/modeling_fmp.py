@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
@@ -21,7 +21,29 @@ from lerobot_pf2mp.policies.fmp.ema import MovingAverage
 from lerobot_pf2mp.policies.fmp.networks import VelocityNetwork
 from lerobot_pf2mp.policies.fmp.real_time_chunking import continuing
 from lerobot_pf2mp.policies.model_card import WithModelCard
+from lerobot_pf2mp.policies.plans.plans import require_finite
 from lerobot_pf2mp.policies.without_peft import WithoutPEFT
+
+
+class Draw(Protocol):
+    """Draws chunks."""
+
+    def __call__(
+        self,
+        noise: Tensor | None = None,
+        generator: torch.Generator | None = None,
+        rows: Tensor | None = None,
+        n_each: int = 1,
+    ) -> Tensor:
+        """Chunks ``(B, n_action_steps, A)`` [normalised].
+
+        Args:
+            noise: ``(B, horizon, A)`` prior samples; drawn from N(0, I) if None.
+            generator: Source of randomness for that draw.
+            rows: ``(F,)`` robots of the batch, for B = F n_each chunks, those of a robot one after the other; None for one
+                chunk of each robot.
+            n_each: Number of chunks for each of these robots.
+        """
 
 
 class FMPPolicy(WithoutPEFT, WithModelCard, PreTrainedPolicy):
@@ -165,35 +187,68 @@ class FMPPolicy(WithoutPEFT, WithModelCard, PreTrainedPolicy):
             **kwargs: Ignored, for callers that pass options of other policies.
 
         Raises:
-            ValueError: If the noise has another shape, or there is a last chunk but real-time chunking is off.
+            ValueError: If the noise has another shape, there is a last chunk but real-time chunking is off, or an action is
+                not finite.
         """
+        draw = self._drawing(
+            batch,
+            guide,
+            inference_delay=inference_delay,
+            prev_chunk_left_over=prev_chunk_left_over,
+            execution_horizon=execution_horizon,
+        )
+        return require_finite(draw(noise, generator), batch)
+
+    def _drawing(
+        self,
+        batch: dict[str, Any],
+        guide: Guide | None,
+        *,
+        inference_delay: int = 0,
+        prev_chunk_left_over: Tensor | None = None,
+        execution_horizon: int | None = None,
+        **_: Any,
+    ) -> Draw:
+        """A function that draws chunks for a batch. The observations are encoded once. Arguments as above."""
         if prev_chunk_left_over is not None and self._rtc_processor is None:
             raise ValueError(
                 "prev_chunk_left_over needs rtc_config, got none: call init_rtc_processor() after setting it"
             )
         network = self.inference_network
-        condition = network.encoder(self._observation_window(batch))
-        shape = (condition.shape[0], self.config.horizon, self.config.action_feature.shape[0])
-        if noise is None:
-            noise = torch.randn(shape, device=condition.device, generator=generator)
-        elif tuple(noise.shape) != shape:
-            raise ValueError(f"noise must have shape {shape}, got {tuple(noise.shape)}")
-
-        steer = None
-        if self._rtc_processor is not None and prev_chunk_left_over is not None:
-            steer = continuing(self._rtc_processor, prev_chunk_left_over, inference_delay, execution_horizon)
-        chunk = integrate(
-            lambda x_t, t: network(x_t, t, condition),
-            noise.to(device=condition.device, dtype=torch.float32),
-            self.config.num_inference_steps,
-            integrator=self.config.integrator,
-            guide=guide,
-            steer=steer,
-        )  # (B, T, A)
+        encoded = network.encoder(self._observation_window(batch))
         start = self.config.n_obs_steps - 1
-        if self._rtc_processor is not None:
-            return chunk[:, start:]
-        return chunk[:, start : start + self.config.n_action_steps]
+        end = None if self._rtc_processor is not None else start + self.config.n_action_steps
+
+        def draw(
+            noise: Tensor | None = None,
+            generator: torch.Generator | None = None,
+            rows: Tensor | None = None,
+            n_each: int = 1,
+        ) -> Tensor:
+            condition, left_over = encoded, prev_chunk_left_over
+            if rows is not None:
+                condition = encoded[rows].repeat_interleave(n_each, dim=0)
+                if left_over is not None and left_over.ndim == 3 and len(left_over) == len(encoded):
+                    left_over = left_over[rows].repeat_interleave(n_each, dim=0)
+            shape = (condition.shape[0], self.config.horizon, self.config.action_feature.shape[0])
+            if noise is None:
+                noise = torch.randn(shape, device=condition.device, generator=generator)
+            elif tuple(noise.shape) != shape:
+                raise ValueError(f"noise must have shape {shape}, got {tuple(noise.shape)}")
+            steer = None
+            if self._rtc_processor is not None and left_over is not None:
+                steer = continuing(self._rtc_processor, left_over, inference_delay, execution_horizon)
+            chunk = integrate(
+                lambda x_t, t: network(x_t, t, condition),
+                noise.to(device=condition.device, dtype=torch.float32),
+                self.config.num_inference_steps,
+                integrator=self.config.integrator,
+                guide=guide,
+                steer=steer,
+            )  # (B, T, A)
+            return chunk[:, start:end]
+
+        return draw
 
     @torch.no_grad()
     def select_action(

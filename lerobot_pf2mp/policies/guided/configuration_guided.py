@@ -9,7 +9,7 @@ from lerobot.configs import PolicyFeature
 
 from lerobot_pf2mp.guidance import GuidanceSettings
 from lerobot_pf2mp.policies.guided.field_settings import FieldSettings
-from lerobot_pf2mp.policies.guided.support_monitor import ON_UNSUPPORTED
+from lerobot_pf2mp.policies.plans.plans import ON_UNSUPPORTED
 
 # Policies read their settings for every chunk. The caches create and validate equal settings only once.
 _field_settings = lru_cache(maxsize=64)(FieldSettings)
@@ -31,8 +31,17 @@ class GuidedConfig:
         guidance_integrator: proximal (solved exactly over a step, insensitive to lambda) or euler (Algorithm 2 as printed).
         guidance_point: The point at which each step evaluates the field: current (A_t), end (the end point that the step
             predicts) or next (after the step). None is the integrator's own: current for euler, end for proximal.
-        on_unsupported: What happens when planned actions leave the demonstrated region: ignore, warn or hold, see
-            `SupportMonitor`. warn and hold need the field, also with guidance_scale=0.
+        guidance_region: Where the field pulls: everywhere (the paper); unsupported, where the log density is below that of
+            guidance_quantile; or fading, fully outside the safe set and the less the nearer it is to that quantile.
+        guidance_quantile: Quantile of the densities of demonstrated actions above which actions are left as they are, for
+            guidance_region unsupported and fading.
+        max_plans: Largest number of plans that are drawn for one that is executed. A plan whose way leaves the demonstrated
+            region is drawn again, and the first one that does not is executed; 1 draws no second plan.
+        false_alarm_rate: Largest probability with which a plan as good as a fresh demonstration is flagged, that is, counts
+            as leaving the demonstrated region. With n demonstrated plans it is at least 1/(n + 1).
+        on_unsupported: What happens if the best of `max_plans` plans is still flagged: ignore, warn (log a line), hold
+            (warn, and stay where the way leaves the region) or stop (raise an error), see `react`. All but ignore need the
+            field, also with guidance_scale=0.
         n_field_points: Demonstrated actions M kept as anchors of the field.
         field_action_dims: Action dimensions the field covers; None covers all. A gripper's opening is usually left out.
         field_bandwidth: Kernel bandwidth h [normalised action units], or how to choose it: likelihood (maximum likelihood
@@ -49,6 +58,10 @@ class GuidedConfig:
     guidance_scale: float = GuidanceSettings.scale
     guidance_integrator: str = GuidanceSettings.integrator
     guidance_point: str | None = GuidanceSettings.point
+    guidance_region: str = FieldSettings.region
+    guidance_quantile: float = FieldSettings.quantile
+    max_plans: int = 8
+    false_alarm_rate: float = 0.01
     on_unsupported: str = "ignore"
     n_field_points: int = FieldSettings.n_points
     field_action_dims: tuple[int, ...] | None = FieldSettings.action_dims
@@ -87,11 +100,17 @@ class GuidedConfig:
             self.field_leave_out,
             None if self.field_angle_dims is None else tuple(self.field_angle_dims),
             self.field_angle_period,
+            self.guidance_region,
+            self.guidance_quantile,
         )
 
     def _validate_guidance(self) -> None:
         if self.on_unsupported not in ON_UNSUPPORTED:
             raise ValueError(f"on_unsupported must be one of {ON_UNSUPPORTED}, got {self.on_unsupported!r}")
+        if self.max_plans < 1:
+            raise ValueError(f"max_plans must be at least 1, got {self.max_plans}")
+        if not 0 < self.false_alarm_rate < 1:
+            raise ValueError(f"false_alarm_rate must lie between 0 and 1, got {self.false_alarm_rate}")
         # They validate their own values. Not from the caches, which take hashable values only.
         GuidanceSettings(self.guidance_scale, self.guidance_integrator, self.guidance_point)
         FieldSettings(*self._field_values)

@@ -4,17 +4,27 @@
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from lerobot_pf2mp.policies.guided.field_settings import FieldSettings
+from lerobot_pf2mp.density.held_out import HeldOut, group_numbers
+from lerobot_pf2mp.policies.guided.field_settings import FieldSettings, has_same_density
 from lerobot_pf2mp.policies.guided.field_state import ANCHOR, OUTLYING, SAFE_ANCHOR, FieldState
 from lerobot_pf2mp.policies.guided.frame_ranks import frame_of, rank_of
 from lerobot_pf2mp.policies.guided.recorded_angles import JUMP, steps_seen
 from lerobot_pf2mp.policies.guided.remarks import remarks_on_dimensions, remarks_on_outlying
-from lerobot_pf2mp.potential_field import JudgedFit, PotentialField, fit, fit_judged
+from lerobot_pf2mp.policies.plans.demonstrated_plans import DemonstratedPlans, states_are_places
+from lerobot_pf2mp.policies.plans.plan_threshold import PlanThreshold
+from lerobot_pf2mp.potential_field import (
+    JudgedFit,
+    PotentialField,
+    fit,
+    fit_judged,
+    just_below_quantile,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -41,6 +51,7 @@ class DemonstratedActions:
     def _forget_units(self) -> None:
         self._unit = torch.empty(0)  # (D,) one recorded unit [normalised]; empty if unknown
         self._steps = torch.empty(0, dtype=torch.uint8)  # (D,) `steps_seen` so far; empty if unknown
+        self._places = torch.empty(0, 0)  # (2, D) see `places_of_states`
 
     def _start_afresh(self, dataset_id: bytes, why: str = "") -> None:
         if why:
@@ -55,8 +66,15 @@ class DemonstratedActions:
         self._ranks = torch.empty(0, dtype=torch.int64)  # (P,) ascending
         self._points = torch.empty(0, 0)  # (P, D), in the order of the ranks
         self._episodes = torch.empty(0, dtype=torch.int64)  # (P,) -1 if unknown
+        self.plans = DemonstratedPlans()
+        self._n_executed = 1  # actions of a plan that training's policy executes
+        self._forget_field()
+
+    def _forget_field(self) -> None:
         self._fitted: tuple[FieldSettings, PotentialField] | None = None
         self._is_outlying = torch.empty(0, dtype=torch.bool)  # (P,) of the fitted field's points
+        self._held_out = torch.empty(0)  # (N,) log densities of its points without their own episodes [nats]
+        self._plan_scores: tuple[FieldSettings, int, Tensor] | None = None  # and for how many actions
 
     def __len__(self) -> int:
         return len(self._ranks)
@@ -86,6 +104,10 @@ class DemonstratedActions:
         settings: FieldSettings,
         unit: Tensor | None = None,
         dataset_id: bytes = b"",
+        n_past: int = 0,
+        n_executed: int | None = None,
+        states: Tensor | None = None,
+        places: Tensor | None = None,
     ) -> None:
         """Adds the actions of a training batch to the sample.
 
@@ -101,6 +123,10 @@ class DemonstratedActions:
                 if it is unknown.
             dataset_id: Identifies the run's frames and their normalisation. If it differs from that of before, a new
                 sample starts.
+            n_past: Number of a chunk's first actions that lie before the current step.
+            n_executed: Number of actions from the current step on that the policy executes; None if the chunks are no plans.
+            states: ``(B, A)`` observed states at the current step [normalised]; None if there are none.
+            places: ``(2, A)`` how states become actions, see `places_of_states`; None if it is unknown.
 
         Raises:
             ValueError: If an action is not finite or a dimension does not exist.
@@ -113,6 +139,15 @@ class DemonstratedActions:
         actions = actions.detach().float()
         if unit is not None:
             self.recognise_angles(actions, is_pad, unit)
+        if n_executed is not None and frames is not None and episodes is not None:
+            self.observe_plans(
+                actions[:, n_past:],
+                frames + n_past,
+                episodes,
+                states=states,
+                places=places,
+                n_executed=n_executed,
+            )
         actions = _select_dims(actions, settings.action_dims)
         steps = torch.arange(actions.shape[1], device=actions.device)
         if frames is None:
@@ -126,6 +161,47 @@ class DemonstratedActions:
         if len(self) >= settings.n_points:
             keep = keep & (ranks <= self._ranks[settings.n_points - 1].to(ranks.device))
         self._merge(ranks[keep], actions[keep], episodes[keep])
+
+    def observe_plans(
+        self,
+        actions: Tensor,
+        frames: Tensor,
+        episodes: Tensor,
+        *,
+        states: Tensor | None,
+        places: Tensor | None,
+        n_executed: int,
+    ) -> None:
+        """Adds demonstrated plans, with which plans are calibrated.
+
+        Args:
+            actions: ``(B, T, A)`` actions from the current step on [normalised].
+            frames: ``(B,)`` index in the dataset of the current step.
+            episodes: ``(B,)`` episode numbers.
+            states: As for `observe`.
+            places: As there.
+            n_executed: As there.
+        """
+        self._n_executed = n_executed
+        dims = self.settings.action_dims
+        actions = _select_dims(actions.detach().float(), dims)
+        start = actions[:, 0]
+        self._places = torch.empty(0, 0)
+        if places is not None and places.numel() and states is not None:
+            self._places = torch.stack([_select_dims(row, dims) for row in places.cpu()])
+            start = self.place_of(states.detach().to(start))
+        ways = torch.cat([start.unsqueeze(1), actions], dim=1)
+        if self.plans.observe(ways, episodes.reshape(-1), frames.reshape(-1)):
+            self._plan_scores = None
+
+    def place_of(self, states: Tensor) -> Tensor:
+        """Where a robot is, as an action over the field's dimensions, ``(B, D)`` [normalised].
+
+        Args:
+            states: ``(B, A)`` observed states [normalised], of which `places` are known.
+        """
+        factors, offsets = self._places.to(states)
+        return factors * _select_dims(states, self.settings.action_dims) + offsets
 
     def recognise_angles(self, actions: Tensor, is_pad: Tensor | None, unit: Tensor) -> None:
         """Looks for jumps by a period in successive actions, which make their dimension an angle.
@@ -141,7 +217,7 @@ class DemonstratedActions:
         if len(self._steps):
             steps |= self._steps
         if not torch.equal(steps == JUMP, self._steps == JUMP):
-            self._fitted = None
+            self._forget_field()
         self._steps = steps
 
     def field(
@@ -163,13 +239,74 @@ class DemonstratedActions:
         settings = settings or self.settings
         self._check(settings)
         if self._fitted is None or self._fitted[0] != settings:
-            if self._fitted is not None and replace(self._fitted[0], alpha=settings.alpha) == settings:
-                field = replace(self._fitted[1], alpha=settings.alpha)
+            if self._fitted is not None and has_same_density(self._fitted[0], settings):
+                field = self._fitted[1]
             else:
                 field = self._fit(settings)
-            self._fitted = (settings, field)
+            self._fitted = (settings, self._on_density(field, settings))
         self._fitted = (settings, self._fitted[1].to(device))
         return self._fitted[1]
+
+    def plan_threshold(
+        self, settings: FieldSettings, n_actions: int, false_alarm_rate: float
+    ) -> PlanThreshold:
+        """The threshold for the support of plans, calibrated on demonstrated plans.
+
+        Args:
+            settings: The settings of the field.
+            n_actions: Number of actions of a plan that are executed.
+            false_alarm_rate: Largest probability with which a plan as good as a fresh demonstration is flagged.
+
+        Raises:
+            ValueError: If there are no demonstrated plans, none that other episodes can judge, or they have fewer actions.
+        """
+        self._check(settings)
+        remedy = "pf2mp-fit-field makes a field that has them, and max_plans=1 with on_unsupported=ignore needs none"
+        if not len(self.plans) or self.episodes is None:
+            raise ValueError(
+                f"the check of plans needs demonstrated plans, got a potential field without them: {remedy}"
+            )
+        if n_actions > self.plans.n_actions:
+            raise ValueError(
+                f"the check of plans needs demonstrated plans of {n_actions} actions, got a potential field with plans of "
+                f"{self.plans.n_actions}: {remedy}"
+            )
+        known = self._plan_scores
+        if known is None or known[1] != n_actions or not has_same_density(known[0], settings):
+            known = self._plan_scores = settings, n_actions, self._score_plans(settings, n_actions)
+        if not len(known[2]):
+            raise ValueError(
+                "the check of plans needs demonstrations that other episodes can judge, got a potential field in which "
+                f"nothing is left without a plan's own episode: more demonstrations, or {remedy}"
+            )
+        return PlanThreshold.of(known[2], false_alarm_rate)
+
+    @property
+    def starts_at_state(self) -> bool:
+        """Whether an observed state tells where the robot is, in the units of its actions."""
+        return bool(self._places.numel()) and len(self.plans) > 0 and states_are_places(self.plans.ways)
+
+    def _score_plans(self, settings: FieldSettings, n_actions: int) -> Tensor:
+        field = self.field(settings)
+        is_anchor = ~self._is_outlying
+        episodes = self.episodes if settings.leave_out == "episode" else None
+        return self.plans.scores(
+            field,
+            None if episodes is None else episodes[: settings.n_points][is_anchor],
+            self.frames[: settings.n_points][is_anchor],
+            n_actions,
+            starts_at_state=self.starts_at_state,
+        )
+
+    def _on_density(self, field: PotentialField, settings: FieldSettings) -> PotentialField:
+        """The field with the distance term, and pulling where the settings say."""
+        full = none = math.inf
+        if settings.region != "everywhere":
+            if not len(self._held_out):  # the file of a field from before 0.2
+                self._held_out = _held_out_log_density(field, self.episodes, self.frames[: settings.n_points])
+            none = just_below_quantile(self._held_out, settings.quantile)
+            full = none if settings.region == "unsupported" else min(field.log_threshold, none)
+        return replace(field, alpha=settings.alpha, log_full_pull=full, log_no_pull=none)
 
     def judged(self, settings: FieldSettings | None = None) -> JudgedFit:
         """The field, fitted anew, and how each of its points is judged by other episodes. Arguments and errors as above."""
@@ -205,6 +342,13 @@ class DemonstratedActions:
             unit=self._unit.clone(),
             steps=self._steps.clone(),
             role=role,
+            places=self._places.clone(),
+            held_out=self._held_out.cpu().contiguous(),
+            plans=self.plans.ways.cpu().contiguous(),
+            plan_episodes=self.plans.episodes.cpu().contiguous(),
+            plan_ranks=self.plans.ranks.cpu().contiguous(),
+            plan_scores=self._scores_to_save(),
+            n_executed=torch.tensor(self._n_executed),
         ).tensors()
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
@@ -226,8 +370,13 @@ class DemonstratedActions:
         self._unit, self._steps = read.unit.float(), read.steps
         self._n_shown = int(read.n_shown)
         self._dataset_id = bytes(read.dataset_id.tolist())
+        self._places, self._n_executed = read.places, int(read.n_executed)
+        self.plans.restore(read.plans, read.plan_episodes, read.plan_ranks)
+        self._plan_scores = None
+        if len(read.plan_scores):
+            self._plan_scores = self.settings, self._n_executed, read.plan_scores
         role = read.role[: self.settings.n_points]
-        self._is_outlying = role == OUTLYING
+        self._is_outlying, self._held_out = role == OUTLYING, read.held_out
         field = PotentialField(
             self._points[: self.settings.n_points][~self._is_outlying],
             bandwidth=read.bandwidth.item(),
@@ -237,7 +386,15 @@ class DemonstratedActions:
             # A file of before has no roles. Its safe anchors are those whose own density is above the threshold.
             anchor_is_safe=role[~self._is_outlying] == SAFE_ANCHOR if "role" in state else None,
         )
-        self._fitted = (self.settings, field)
+        self._fitted = (self.settings, self._on_density(field, self.settings))
+
+    def _scores_to_save(self) -> Tensor:
+        if not len(self.plans) or self.episodes is None or self._n_executed > self.plans.n_actions:
+            return torch.empty(0)
+        known = self._plan_scores
+        if known is not None and known[:2] == (self.settings, self._n_executed):
+            return known[2]
+        return self._score_plans(self.settings, self._n_executed)
 
     def _check(self, settings: FieldSettings) -> None:
         if not len(self):
@@ -269,9 +426,12 @@ class DemonstratedActions:
                 alpha=settings.alpha,
                 leave_out="nothing",
             )
+            self._held_out = field.log_density(points)
         else:
             judged = self.judged(settings)
             field, self._is_outlying = judged.field, judged.is_outlying
+            log_density = judged.log_density[~judged.is_far]
+            self._held_out = log_density[log_density.isfinite()].float()
             remark = remarks_on_outlying(judged, self.episodes, self.frames)
             if remark:
                 logger.warning(remark)
@@ -331,7 +491,18 @@ class DemonstratedActions:
         self._ranks = ranks[is_first][:n_points]
         self._points = points[order][is_first][:n_points]
         self._episodes = episodes[order][is_first][:n_points]
-        self._fitted = None
+        self._forget_field()
+
+
+def _held_out_log_density(field: PotentialField, episodes: Tensor | None, frames: Tensor) -> Tensor:
+    """The log densities of a field's anchors, each without its own episode, ``(M,)``."""
+    anchors = field.anchors.cpu()
+    groups = group_numbers(len(anchors), episodes, frames)
+    held_out = HeldOut(anchors, groups, field.periods, frames)
+    if not held_out.can_judge:
+        return field.log_density(anchors)
+    log_density = held_out.judge(field.bandwidth).log_density
+    return log_density[log_density.isfinite()].float()
 
 
 def _select_dims(actions: Tensor, dims: tuple[int, ...] | None) -> Tensor:

@@ -1,27 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
 """The part of a guided policy that uses the potential field.
 
-It adds the actions of training batches to the field, makes the guide from the field, and checks planned actions with it.
+It adds the actions of training batches to the field, makes the guide from the field, and chooses plans with it.
 """
 
 from __future__ import annotations
 
 import hashlib
+import logging
+import time
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.utils.constants import ACTION
+from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
 from lerobot_pf2mp.flow_matching import Guide
 from lerobot_pf2mp.guidance import GuidanceSettings, make_guide
 from lerobot_pf2mp.policies.batch_keys import ACTION_IS_PAD, POTENTIAL_FIELD
 from lerobot_pf2mp.policies.guided.action_kind import warn_unless_positions
-from lerobot_pf2mp.policies.guided.action_units import normalised_unit, normaliser_of
+from lerobot_pf2mp.policies.guided.action_units import normalised_unit, normaliser_of, places_of_states
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
-from lerobot_pf2mp.policies.guided.support_monitor import SupportMonitor
+from lerobot_pf2mp.policies.plans.plan_choice import DrawMore, LatencyBudget, PlanCheck, choose_plans, react
+from lerobot_pf2mp.policies.plans.plans import Plans, require_finite
 from lerobot_pf2mp.potential_field import PotentialField
 from lerobot_pf2mp.training.gathering import gather_rows, is_main_process
 from lerobot_pf2mp.training.run_dataset import find_dataset, run_episodes
@@ -31,6 +34,9 @@ if TYPE_CHECKING:
     from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
 
     type GuidedPolicyConfig = PF2MPConfig | DPPFConfig
+
+
+logger = logging.getLogger(__name__)
 
 
 class FieldGuidance:
@@ -52,27 +58,34 @@ class FieldGuidance:
     ) -> None:
         self.config = config
         self._dataset_id = _identify_dataset(dataset_stats, run_episodes(dataset_meta), config)
-        self._unit = _unit_of_actions(dataset_stats, config)
+        self._unit, self._places = _units_of(dataset_stats, config)
         self._unchecked_meta = dataset_meta  # until its dataset's actions have been looked at
         self.demonstrations: DemonstratedActions | None = None  # those of the last training batch
-        self._monitor = SupportMonitor(config.on_unsupported, config.field_action_dims)
+        # Whether plans are checked even if nothing acts on it: `plans` then tells of them.
+        self.measures_plans = False
+        self._has_warned = False
         self._made: tuple[PotentialField, GuidanceSettings, Guide | None] | None = None
+        self.reset()
 
     def __getstate__(self) -> dict[str, Any]:
         """The state for copies and pickles of the policy. A copy makes its own guide."""
         return {**vars(self), "_made": None, "_unchecked_meta": None}
 
     def reset(self) -> None:
-        """Forgets the last chunk. Must be called at the start of an episode."""
-        self._monitor.reset()
+        """Forgets the plans and actions of before. Must be called at the start of an episode."""
+        self.plans: Plans | None = None  # of the last call; None if they were not checked
+        self._executed: Tensor | None = None  # (B, A) the last action that `select_action` gave away
+        self._last: tuple[Tensor, Tensor] | None = None  # the last chunk (B, T, A) and where it began (B, A)
+        self._budget = LatencyBudget()
 
     @property
     def support(self) -> Tensor | None:
-        """``(B, T)`` log density of the last chunk's actions above the field's threshold [nats], negative outside.
+        """``(B, T)`` how far the last plan's way to each action is inside the demonstrated region [nats].
 
-        None before the first chunk and with ``on_unsupported=ignore``.
+        It is the smallest log density on that piece above the threshold for plans, negative outside. None if plans are not
+        checked, and before the first one.
         """
-        return self._monitor.support
+        return None if self.plans is None else self.plans.action_support
 
     def observe(self, batch: dict[str, Any]) -> None:
         """Adds the actions of a training batch to the field in that batch. A batch without a field changes nothing.
@@ -89,17 +102,29 @@ class FieldGuidance:
         self.demonstrations = demonstrations
         if self._unchecked_meta is not None:
             self._check_dataset()
-        actions, is_pad, frames, episodes = gather_rows(
-            batch[ACTION], batch.get(ACTION_IS_PAD), batch.get("index"), batch.get("episode_index")
+        states = batch.get(OBS_STATE)
+        if states is not None and states.ndim == 3:
+            states = states[:, -1]
+        actions, is_pad, frames, episodes, states = gather_rows(
+            batch[ACTION],
+            batch.get(ACTION_IS_PAD),
+            batch.get("index"),
+            batch.get("episode_index"),
+            states if self._places is not None and self._places.numel() else None,
         )
+        first = self.config.action_delta_indices[0]
         demonstrations.observe(
             cast(Tensor, actions),
             is_pad,
-            None if frames is None else frames + self.config.action_delta_indices[0],
+            None if frames is None else frames + first,
             episodes,
             settings=self.config.field_settings,
             unit=self._unit,
             dataset_id=self._dataset_id,
+            n_past=-first,
+            n_executed=self.config.n_action_steps,
+            states=states,
+            places=self._places,
         )
 
     @torch.compiler.disable
@@ -130,23 +155,127 @@ class FieldGuidance:
             made = self._made = field, settings, make_guide(field.prepared, settings)
         return made[2]
 
-    def check(self, batch: dict[str, Any], chunk: Tensor) -> Tensor:
-        """The actions ``(B, T, A)`` to execute of a planned chunk, see ``on_unsupported`` in `GuidedConfig`.
+    def executed(self, action: Tensor) -> None:
+        """Tells that a robot, or a batch of robots, is given an action ``(B, A)`` to execute [normalised]."""
+        self._executed = action
+
+    @torch.compiler.disable
+    def begin(self, left_over: Tensor | None) -> None:
+        """A call begins; `left_over` holds the actions ``(B, T_left, A)`` of the last chunk that were not executed."""
+        n_executed = None
+        if left_over is not None and self._last is not None:
+            n_executed = max(self._last[0].shape[1] - left_over.shape[1], 0)
+        self._budget.begin(n_executed)
+
+    def choose(
+        self,
+        batch: dict[str, Any],
+        chunk: Tensor,
+        draw_more: DrawMore,
+        left_over: Tensor | None = None,
+        n_steps: int | None = None,
+    ) -> Tensor:
+        """The chunks ``(B, T, A)`` to execute: checked, drawn again if need be, see ``max_plans`` in `GuidedConfig`.
 
         Args:
             batch: A batch that the policy's own preprocessor has made.
             chunk: ``(B, T, A)`` planned actions [normalised].
+            draw_more: Draws further plans.
+            left_over: ``(B, T_left, A)`` actions of the last chunk that were not executed when the call began; None if no
+                robot is moving on them.
+            n_steps: Number of those that are executed until the chunk is needed; None if the robot waits for it.
 
         Raises:
-            ValueError: If actions are checked, and the batch holds no field, or one over other dimensions.
+            ValueError: If an action is not finite; if the field, or its calibration for plans, is missing although plans
+                are to be checked; or if the batch has another size than that of the actions executed before.
+            UnsupportedPlanError: See `react`.
         """
-        return chunk if self.config.on_unsupported == "ignore" else self._monitored(batch, chunk)
+        config = self.config
+        is_checked = config.max_plans > 1 or config.on_unsupported != "ignore" or self.measures_plans
+        if torch.compiler.is_compiling() and POTENTIAL_FIELD not in batch:
+            return require_finite(chunk, batch)  # one graph, for a guide that the caller made
+        return self._choose(batch, chunk, draw_more, left_over, n_steps, is_checked)
 
-    @torch.compiler.disable  # the field may have to be fitted first
-    def _monitored(self, batch: dict[str, Any], chunk: Tensor) -> Tensor:
-        self._monitor.on_unsupported = self.config.on_unsupported
-        self._monitor.action_dims = self.config.field_action_dims
-        return self._monitor(chunk, fitted_field(batch.get(POTENTIAL_FIELD), self.config, chunk.device))
+    @torch.compiler.disable  # whether other plans are drawn depends on the values
+    def _choose(
+        self,
+        batch: dict[str, Any],
+        chunk: Tensor,
+        draw_more: DrawMore,
+        left_over: Tensor | None,
+        n_steps: int | None,
+        is_checked: bool,
+    ) -> Tensor:
+        require_finite(chunk, batch)
+        self.plans = None
+        check = self._plan_check(batch, chunk) if is_checked else None
+        if check is not None:
+            config = self.config
+            places = self._places_of_robots(batch, chunk, left_over)
+
+            def draw(rows: Tensor, n: int) -> Tensor:
+                began = time.perf_counter()
+                more = draw_more(rows, n)
+                self._budget.took(time.perf_counter() - began)
+                return more
+
+            has_time = self._budget.allows_another_pass(n_steps)
+            chunk, self.plans = choose_plans(
+                check, places, chunk, config.max_plans, draw if has_time else None
+            )
+            chunk = react(config.on_unsupported, self.plans, chunk, places)
+            self._last = chunk, places
+        self._executed = None
+        return chunk
+
+    def _plan_check(self, batch: dict[str, Any], chunk: Tensor) -> PlanCheck | None:
+        """The check of plans; None, with a warning, if it is impossible and nothing that was asked for depends on it."""
+        config, demonstrations = self.config, batch.get(POTENTIAL_FIELD)
+        is_asked_for = config.on_unsupported != "ignore" or self.measures_plans
+        try:
+            field = fitted_field(demonstrations, config, chunk.device)
+            threshold = cast(DemonstratedActions, demonstrations).plan_threshold(
+                config.field_settings, chunk.shape[1], config.false_alarm_rate
+            )
+        except ValueError as error:
+            if is_asked_for:
+                raise
+            if not self._has_warned:
+                logger.warning("Plans are not checked, and none is drawn again: %s", error)
+                self._has_warned = True
+            return None
+        return PlanCheck(field, threshold.log_density, config.field_settings.action_dims)
+
+    def _places_of_robots(self, batch: dict[str, Any], chunk: Tensor, left_over: Tensor | None) -> Tensor:
+        """Where the robots are when they begin to execute a chunk, as actions ``(B, A)`` [normalised].
+
+        It is the last action that was executed. Where that is unknown, as in the first chunk, it is the observed state, and
+        the chunk's first action in dimensions that the field does not cover. Without a state in the units of the actions it
+        is the chunk's first action.
+        """
+        n_robots = len(chunk)
+        if self._executed is not None:
+            if len(self._executed) != n_robots:
+                raise ValueError(
+                    f"a batch must have as many robots as before, {len(self._executed)}, until reset() is called, got "
+                    f"{n_robots}"
+                )
+            return self._executed.to(chunk)
+        if left_over is not None and self._last is not None and len(self._last[0]) == n_robots:
+            before, place = self._last
+            n_executed = before.shape[1] - left_over.shape[1]
+            if n_executed >= 0:
+                return (before[:, n_executed - 1] if n_executed else place).to(chunk)
+        demonstrations, states = batch.get(POTENTIAL_FIELD), batch.get(OBS_STATE)
+        first = chunk[:, 0]
+        if not isinstance(demonstrations, DemonstratedActions) or states is None:
+            return first
+        states = states[:, -1] if states.ndim == 3 else states
+        if not demonstrations.starts_at_state or states.shape != first.shape:
+            return first
+        place = demonstrations.place_of(states.to(first))
+        dims = self.config.field_settings.action_dims
+        return place if dims is None else first.index_copy(1, torch.tensor(dims, device=first.device), place)
 
 
 def fitted_field(
@@ -178,12 +307,14 @@ def fitted_field(
     return field
 
 
-def _unit_of_actions(
+def _units_of(
     dataset_stats: dict[str, dict[str, Any]] | None, config: GuidedPolicyConfig
-) -> Tensor | None:
+) -> tuple[Tensor | None, Tensor | None]:
+    """The `normalised_unit` and `places_of_states` of a dataset; None at evaluation."""
     if not dataset_stats or ACTION not in dataset_stats:
-        return None
-    return normalised_unit(normaliser_of(config, dataset_stats), config.action_feature.shape[0])
+        return None, None
+    normaliser, action_dim = normaliser_of(config, dataset_stats), config.action_feature.shape[0]
+    return normalised_unit(normaliser, action_dim), places_of_states(normaliser, action_dim)
 
 
 def _identify_dataset(

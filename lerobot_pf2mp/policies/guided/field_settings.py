@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from lerobot_pf2mp.density.bandwidth import DEFAULT_BANDWIDTH, check_bandwidth_rule
 from lerobot_pf2mp.potential_field import (
@@ -14,6 +14,8 @@ from lerobot_pf2mp.potential_field import (
     check_left_out,
     check_threshold_quantile,
 )
+
+REGIONS = ("everywhere", "unsupported", "fading")
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,9 @@ class FieldSettings:
         angle_dims: Action dimensions that are angles, among those that the field covers. None: those in which recorded
             actions jump by a period from one frame to the next.
         angle_period: The period of these angles, in the units of the recorded actions [rad, or degrees with 360].
+        region: Where the field pulls, one of `REGIONS`: everywhere; unsupported, where the log density is below that of
+            `quantile`; or fading, fully outside the safe set and the less the nearer the log density is to that quantile.
+        quantile: The quantile of the actions' log densities above which the field does not pull, in (0, 1).
 
     Raises:
         ValueError: If a value breaks its rule. The message names the option of the policy's configuration.
@@ -43,6 +48,8 @@ class FieldSettings:
     leave_out: str = LEFT_OUT[0]
     angle_dims: tuple[int, ...] | None = None
     angle_period: float = 2 * math.pi
+    region: str = "everywhere"
+    quantile: float = 0.5
 
     def __post_init__(self) -> None:
         if self.n_points < 1:
@@ -61,10 +68,21 @@ class FieldSettings:
                 )
         if not (self.angle_period > 0 and math.isfinite(self.angle_period)):
             raise ValueError(f"field_angle_period must be finite and positive, got {self.angle_period}")
+        if self.region not in REGIONS:
+            raise ValueError(f"guidance_region must be one of {REGIONS}, got {self.region!r}")
+        if not 0 < self.quantile < 1:
+            raise ValueError(f"guidance_quantile must lie between 0 and 1, got {self.quantile}")
         check_left_out(self.leave_out, "field_leave_out")
         check_bandwidth_rule(self.bandwidth, "field_bandwidth")
         check_threshold_quantile(self.threshold_quantile, "field_threshold_quantile")
         check_alpha(self.alpha, "field_alpha")
+
+
+def has_same_density(first: FieldSettings, second: FieldSettings) -> bool:
+    """Whether two settings differ at most in what is built on the density: the distance term and where the field pulls."""
+    return replace(first, alpha=0.0, region="everywhere", quantile=0.5) == replace(
+        second, alpha=0.0, region="everywhere", quantile=0.5
+    )
 
 
 def _check_dims(name: str, dims: tuple[int, ...]) -> None:

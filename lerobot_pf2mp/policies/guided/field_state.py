@@ -27,6 +27,13 @@ class FieldState:
         unit: ``(D,)`` one recorded unit [normalised]; empty if unknown.
         steps: ``(D,)`` uint8, see `steps_seen`; empty if unknown.
         role: ``(P,)`` uint8: `OUTLYING`, `ANCHOR` or `SAFE_ANCHOR`.
+        places: ``(2, D)`` how states become actions, see `places_of_states`; empty if unknown.
+        held_out: ``(N,)`` log densities of points without their own episodes [nats]; empty if unknown.
+        plans: ``(E, T + 1, D)`` demonstrated plans, see `DemonstratedPlans`; empty if unknown.
+        plan_episodes: ``(E,)`` int64, their episodes.
+        plan_ranks: ``(E,)`` int64, the ranks of their first frames.
+        plan_scores: ``(n,)`` the support of demonstrated plans [nats]; empty if unknown.
+        n_executed: Number of their actions on whose way that is.
     """
 
     points: Tensor
@@ -39,6 +46,13 @@ class FieldState:
     unit: Tensor
     steps: Tensor
     role: Tensor
+    places: Tensor
+    held_out: Tensor
+    plans: Tensor
+    plan_episodes: Tensor
+    plan_ranks: Tensor
+    plan_scores: Tensor
+    n_executed: Tensor
 
     def tensors(self) -> dict[str, Tensor]:
         """The tensors by name."""
@@ -48,13 +62,14 @@ class FieldState:
     def read(cls, tensors: dict[str, Tensor]) -> FieldState:
         """The state in a file's tensors.
 
-        Files of before 0.2 have no episodes, unit, steps and role. Their episodes are unknown, none of their dimensions
-        is an angle, and all points are anchors.
+        Files of before 0.2 lack what was added since. Their episodes are unknown, none of their dimensions is an angle, all
+        points are anchors, and there are no demonstrated plans.
 
         Raises:
             ValueError: If an entry is missing or of the wrong kind, as in a corrupted file.
         """
-        added = {"episodes", "unit", "steps", "role"}
+        added = {"episodes", "unit", "steps", "role", "places", "held_out", "n_executed"}
+        added |= {"plans", "plan_episodes", "plan_ranks", "plan_scores"}
         wanted = {field.name for field in fields(cls)} - added
         if not wanted <= set(tensors):
             raise ValueError(
@@ -77,10 +92,18 @@ class FieldState:
             "unit": torch.empty(0),
             "steps": torch.empty(0, dtype=torch.uint8),
             "role": torch.full((len(points),), ANCHOR, dtype=torch.uint8),
+            "places": torch.empty(0, 0),
+            "held_out": torch.empty(0),
+            "plans": torch.empty(0, 0, 0),
+            "plan_episodes": torch.empty(0, dtype=torch.int64),
+            "plan_ranks": torch.empty(0, dtype=torch.int64),
+            "plan_scores": torch.empty(0),
+            "n_executed": torch.tensor(1),
         }
         if len(tensors.get("unit", ())) not in (0, points.shape[1]):
             # Points of other dimensions than the policy's. The policy says so where it needs the field.
-            tensors = {name: value for name, value in tensors.items() if name not in ("unit", "steps")}
+            about_dims = "unit", "steps", "places", "plans", "plan_episodes", "plan_ranks", "plan_scores"
+            tensors = {name: value for name, value in tensors.items() if name not in about_dims}
         state = cls(**{name: {**defaults, **tensors}[name] for name in wanted | added})
         state._check_added()
         return state
@@ -99,6 +122,7 @@ class FieldState:
                     f"{name} in a potential field file must be {size} numbers of type {dtype}, got "
                     f"{tuple(value.shape)} of {value.dtype}: it is corrupted"
                 )
+        self._check_plans()
         if not bool((self.role != OUTLYING).any()) or bool((self.role > SAFE_ANCHOR).any()):
             raise ValueError(
                 "role in a potential field file must be 0, 1 or 2 and not 0 for all: it is corrupted"
@@ -106,4 +130,31 @@ class FieldState:
         if not bool((self.unit >= 0).all()) or not bool(self.unit.isfinite().all()):
             raise ValueError(
                 f"unit in a potential field file must be finite and at least 0, got {self.unit.tolist()}: it is corrupted"
+            )
+
+    def _check_plans(self) -> None:
+        n_plans, dim = len(self.plan_ranks), self.points.shape[1]
+        n_corners = self.plans.shape[1] if self.plans.ndim == 3 else 0
+        wanted = (n_plans, n_corners, dim) if n_plans else (0, 0, 0)
+        if self.plans.shape != wanted or n_corners == 1 or self.plan_episodes.shape != self.plan_ranks.shape:
+            raise ValueError(
+                "a potential field file must hold plans (E, T + 1, D) with E episodes and ranks, got plans "
+                f"{tuple(self.plans.shape)}, {tuple(self.plan_episodes.shape)} episodes and {n_plans} ranks: it is corrupted"
+            )
+        if self.places.numel() and self.places.shape != (2, dim):
+            raise ValueError(
+                f"places in a potential field file must be 2 x {dim} numbers, got {tuple(self.places.shape)}: it is "
+                "corrupted"
+            )
+        for name in ("places", "held_out", "plans", "plan_scores"):
+            value = getattr(self, name)
+            if value.dtype != torch.float32 or not bool(value.isfinite().all()):
+                raise ValueError(
+                    f"{name} in a potential field file must be finite numbers of type {torch.float32}, got "
+                    f"{value.dtype}: it is corrupted"
+                )
+        if self.n_executed.numel() != 1 or int(self.n_executed) < 1:
+            raise ValueError(
+                "n_executed in a potential field file must be one number from 1 on, got "
+                f"{self.n_executed.tolist()}: it is corrupted"
             )

@@ -12,15 +12,17 @@ from lerobot_pf2mp.flow_matching import Guide
 from lerobot_pf2mp.policies.fmp.modeling_fmp import FMPPolicy
 from lerobot_pf2mp.policies.guided.field_guidance import FieldGuidance
 from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
+from lerobot_pf2mp.policies.plans.plans import Plans
 
 
 class PF2MPPolicy(FMPPolicy):
     """`FMPPolicy` with a potential field.
 
-    Training also adds its actions to the field, the guide changes every integration step, and each chunk is checked. The
-    weights are those of `FMPPolicy`, and with ``guidance_scale=0`` so are the actions. The calls for an observation are
+    Training also adds its actions to the field, the guide changes every integration step, and each chunk is checked, and
+    drawn again if it leaves the demonstrated region. The weights are those of `FMPPolicy`, and with ``guidance_scale=0`` and
+    ``max_plans=1`` so are the actions. The calls for an observation are
 
-        select_action -> predict_action_chunk (below: guide) -> FMPPolicy.predict_action_chunk
+        select_action -> predict_action_chunk (below: guide, choice)
             -> integrate (each step: velocity, guide) -> VelocityNetwork
 
     Args:
@@ -59,21 +61,38 @@ class PF2MPPolicy(FMPPolicy):
         guide: Guide | None = None,
         **options: Any,
     ) -> Tensor:
-        """The chunk of `FMPPolicy` with a guide in every integration step. The chunk is then checked.
+        """The chunk of `FMPPolicy` with a guide in every integration step, chosen among up to ``max_plans``.
 
         Args:
             batch: As for `FMPPolicy.predict_action_chunk`, with the potential field.
-            noise: As there.
+            noise: As there, for the first plan. Others are drawn from the same generator.
             generator: As there.
             guide: The guide to use instead of the configured one; None for the configured one.
-            **options: Options of real-time chunking, as there.
+            **options: Options of real-time chunking, as there. No plan is drawn again that would come too late.
 
         Raises:
-            ValueError: If there is guidance, or a check, and the batch holds no field or one over other dimensions.
+            ValueError: If there is guidance, or a check that was asked for, and the batch holds no field, one over other
+                dimensions, or one without demonstrated plans; or if an action is not finite.
+            UnsupportedPlanError: With ``on_unsupported=stop``, if no plan stays in the demonstrated region.
         """
+        left_over = options.get("prev_chunk_left_over")
+        n_steps = None if left_over is None else options.get("inference_delay", 0)
+        self.guidance.begin(left_over)
         guide = guide or self.guidance.guide(batch, next(self.parameters()).device)
-        chunk = super().predict_action_chunk(batch, noise, generator, guide, **options)
-        return self.guidance.check(batch, chunk)
+        draw = self._drawing(batch, guide, **options)
+        return self.guidance.choose(
+            batch,
+            draw(noise, generator),
+            lambda rows, n: draw(generator=generator, rows=rows, n_each=n),
+            left_over,
+            n_steps,
+        )
+
+    def select_action(self, batch: dict[str, Any], *args: Any, **kwargs: Any) -> Tensor:
+        """The action of `FMPPolicy`, which the next plan's way begins with."""
+        action = super().select_action(batch, *args, **kwargs)
+        self.guidance.executed(action)
+        return action
 
     def reset(self) -> None:
         """Forgets past observations and planned actions. Must be called at the start of an episode."""
@@ -81,6 +100,11 @@ class PF2MPPolicy(FMPPolicy):
         self.guidance.reset()
 
     @property
+    def plans(self) -> Plans | None:
+        """What is known of the last plans; None if they were not checked."""
+        return self.guidance.plans
+
+    @property
     def support(self) -> Tensor | None:
-        """``(B, T)`` how far the last chunk's actions are inside the demonstrated region, see `FieldGuidance.support`."""
+        """``(B, T)`` how far the last chunk's way is inside the demonstrated region, see `FieldGuidance.support`."""
         return self.guidance.support

@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Draws other plans for robots whose plan leaves the demonstrated region, and chooses one for each."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from lerobot_pf2mp.policies.plans.plans import Plans, UnsupportedPlanError
+from lerobot_pf2mp.potential_field import PotentialField
+from lerobot_pf2mp.potential_field.ways import way_log_density
+
+logger = logging.getLogger(__name__)
+
+# Draws n plans for each of some robots: maps ``(F,)`` their rows and n to ``(F n, T, A)``.
+DrawMore = Callable[[Tensor, int], Tensor]
+
+
+@dataclass(frozen=True, eq=False)
+class PlanCheck:
+    """Judges the ways of plans.
+
+    Args:
+        field: The potential field.
+        log_threshold: The log density below which a way leaves the demonstrated region [nats].
+        dims: Action dimensions that the field covers; None for all.
+    """
+
+    field: PotentialField
+    log_threshold: float
+    dims: tuple[int, ...] | None = None
+
+    def __call__(self, places: Tensor, chunks: Tensor) -> Tensor:
+        """The support of each action: the smallest log density on the way that leads to it, above the threshold.
+
+        Args:
+            places: ``(B, A)`` where the robots are [normalised].
+            chunks: ``(B, T, A)`` planned actions [normalised].
+
+        Returns:
+            ``(B, T)`` [nats], negative outside; -inf for actions that are not finite.
+        """
+        ways = torch.cat([places.unsqueeze(1), chunks], dim=1).float()
+        if self.dims is not None:
+            ways = ways[..., list(self.dims)]
+        is_finite = ways.isfinite().all(dim=-1)  # (B, T + 1)
+        density = way_log_density(
+            lambda points, _: self.field.log_density(points),
+            ways.nan_to_num(0.0, 0.0, 0.0),
+            self.field.bandwidth,
+            self.field.periods,
+        )
+        is_known = is_finite[:, 1:] & is_finite[:, :-1]
+        return torch.where(is_known, density - self.log_threshold, -torch.inf)
+
+
+def choose_plans(
+    check: PlanCheck, places: Tensor, chunk: Tensor, max_plans: int, draw_more: DrawMore | None
+) -> tuple[Tensor, Plans]:
+    """Chooses a plan for each robot: the first one whose whole way is supported, in the order in which they are drawn.
+
+    For the robots whose first plan is not, all others are drawn at once. If none of them is supported either, it is the
+    one with the best support. The first supported plan is a sample of the policy, given that it is supported. The best
+    supported one of several would prefer the beaten track.
+
+    Args:
+        check: Judges ways.
+        places: ``(B, A)`` where the robots are [normalised].
+        chunk: ``(B, T, A)`` the first plans [normalised].
+        max_plans: Largest number of plans for a robot.
+        draw_more: Draws the others; None if there is no time.
+
+    Returns:
+        ``(B, T, A)`` the chosen plans, and what is known of them.
+    """
+    support = check(places, chunk)  # (B, T)
+    n_drawn = torch.ones(len(chunk), dtype=torch.int64, device=chunk.device)
+    is_flagged = support.amin(dim=1) < 0
+    if max_plans > 1 and draw_more is not None and bool(is_flagged.any()):
+        rows, n_more = is_flagged.nonzero().squeeze(1), max_plans - 1
+        others = draw_more(rows, n_more)  # (F n, T, A)
+        their_support = check(places[rows].repeat_interleave(n_more, dim=0), others)
+        others, their_support = (
+            torch.cat([first[rows].unsqueeze(1), more.unflatten(0, (len(rows), n_more))], dim=1)
+            for first, more in ((chunk, others), (support, their_support))
+        )  # (F, 1 + n, T, ...)
+        smallest = their_support.amin(dim=2)  # (F, 1 + n)
+        is_supported = smallest >= 0
+        best = torch.where(is_supported.any(dim=1), is_supported.int().argmax(dim=1), smallest.argmax(dim=1))
+        robots = torch.arange(len(rows), device=rows.device)
+        chunk = chunk.index_copy(0, rows, others[robots, best].to(chunk.dtype))
+        support = support.index_copy(0, rows, their_support[robots, best])
+        n_drawn = n_drawn.index_fill(0, rows, max_plans)
+    smallest = support.amin(dim=1)
+    return chunk, Plans(n_drawn, smallest < 0, smallest, support)
+
+
+def react(on_unsupported: str, plans: Plans, chunk: Tensor, places: Tensor) -> Tensor:
+    """The actions to execute of chosen plans, some of which may still leave the demonstrated region.
+
+    Args:
+        on_unsupported: ignore; warn (logs a line); hold (warns, and from the first action on to which the way is
+            unsupported, repeats the action before it: where the robot is, if that is the first one); or stop.
+        plans: The plans.
+        chunk: ``(B, T, A)`` their actions [normalised].
+        places: ``(B, A)`` where the robots are [normalised].
+
+    Raises:
+        UnsupportedPlanError: With stop, if a plan leaves the region.
+    """
+    if on_unsupported == "ignore" or not bool(plans.is_flagged.any()):
+        return chunk
+    n_flagged, n_plans = int(plans.is_flagged.sum()), len(plans.is_flagged)
+    what = "The plan leaves" if n_plans == 1 else f"{n_flagged} of {n_plans} plans leave"
+    message = (
+        f"{what} the demonstrated region by up to {-plans.support.min().item():.1f} nats, the best of "
+        f"{int(plans.n_drawn.max())} drawn"
+    )
+    if on_unsupported == "stop":
+        raise UnsupportedPlanError(f"{message}; nothing of it is executed (on_unsupported=stop)")
+    logger.warning(message)
+    return chunk if on_unsupported == "warn" else hold(chunk, places, plans.action_support)
+
+
+def hold(chunk: Tensor, places: Tensor, action_support: Tensor) -> Tensor:
+    """Chunks ``(B, T, A)`` up to the first action with negative support; then the action before it, or the place."""
+    is_followed = (action_support >= 0).cumprod(dim=1).bool()  # (B, T)
+    last = is_followed.sum(dim=1)  # 0: none
+    stops = torch.cat([places.unsqueeze(1).to(chunk), chunk], dim=1)[
+        torch.arange(len(chunk), device=chunk.device), last
+    ]
+    return torch.where(is_followed.unsqueeze(-1), chunk, stops.unsqueeze(1))
+
+
+class LatencyBudget:
+    """Whether another pass of the network would be too late, when a robot moves while its next plan is generated.
+
+    With real-time chunking, the caller says after how many steps of the last plan it wants the next one. The duration of
+    a step follows from the time between two calls, and from the steps that were executed in between.
+    """
+
+    def __init__(self) -> None:
+        self._pass: float | None = None  # [s], of further plans
+        self._step: float | None = None  # [s]
+        self._began: float | None = None
+
+    def begin(self, n_executed: int | None) -> None:
+        """A call begins; `n_executed` steps were executed since the last one, None if that is unknown."""
+        now = time.perf_counter()
+        if self._began is not None and n_executed:
+            self._step = (now - self._began) / n_executed
+        self._began = now
+
+    def allows_another_pass(self, n_steps: int | None) -> bool:
+        """Whether another pass ends within `n_steps` steps since the call began; None: the robot waits for the plan."""
+        if n_steps is None or self._began is None:
+            return True
+        if self._step is None:
+            return False
+        elapsed = time.perf_counter() - self._began
+        expected = elapsed if self._pass is None else self._pass
+        return elapsed + expected <= n_steps * self._step
+
+    def took(self, seconds: float) -> None:
+        """Another pass took this long [s]."""
+        self._pass = seconds
