@@ -10,6 +10,7 @@ from lerobot_pf2mp.potential_field.fitting import (
     check_threshold_quantile,
     fit,
     fit_judged,
+    just_below,
     just_below_quantile,
 )
 
@@ -24,5 +25,6 @@ __all__ = [
     "check_threshold_quantile",
     "fit",
     "fit_judged",
+    "just_below",
     "just_below_quantile",
 ]

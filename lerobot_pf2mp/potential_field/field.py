@@ -146,6 +146,25 @@ class PotentialField:
         return self.log_density_and_mean_shift(a)[0]
 
     @torch.no_grad()
+    def without_own_group(
+        self, a: Tensor, groups: Tensor, groups_of_anchors: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """What the anchors of other groups, for example episodes, say of actions. It cannot be compiled.
+
+        Args:
+            a: ``(Q, D)`` actions [normalised].
+            groups: ``(Q,)`` int64 their group numbers, see `group_numbers`.
+            groups_of_anchors: ``(M,)`` int64 those of the anchors.
+
+        Returns:
+            ``(Q,)`` the log density if the kernels of the own group were zero [nats], -inf if nothing else remains;
+            ``(Q,)`` the distance to the nearest anchor of another group [normalised], inf if nothing else remains.
+        """
+        sums = KernelSums(self.anchors, self.bandwidth, self.periods, groups_of_anchors)
+        log_sums, distances = sums.sums_without_own_group(self._flatten(a), groups)
+        return log_sums - self._log_normaliser, distances
+
+    @torch.no_grad()
     def mean_shift(self, a: Tensor) -> Tensor:
         """The vector m(a) - a to the kernel-weighted mean m(a) of the anchors, along which log p(a) rises.
 

@@ -195,8 +195,13 @@ def just_below_quantile(log_densities: Tensor, quantile: float) -> float:
     rank = max(1, math.ceil(quantile * len(known)))
     # kthvalue rather than torch.quantile, which refuses more than 2^24 elements.
     value = known.kthvalue(rank).values.item()
+    return just_below(value)
+
+
+def just_below(log_density: float) -> float:
+    """A number just below a log density; `_TIES` says how far."""
     absolute, relative = _TIES
-    return value - absolute - relative * abs(value)
+    return log_density - absolute - relative * abs(log_density)
 
 
 def _check_points(points: Tensor, episodes: Tensor | None, times: Tensor | None) -> None:

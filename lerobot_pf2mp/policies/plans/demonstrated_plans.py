@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import torch
 from torch import Tensor
 
-from lerobot_pf2mp.density.held_out import HeldOut, group_numbers
+from lerobot_pf2mp.density.held_out import group_numbers
 from lerobot_pf2mp.density.kernels import wrap
 from lerobot_pf2mp.policies.guided.frame_ranks import frame_of, rank_of
 from lerobot_pf2mp.potential_field import PotentialField
@@ -18,9 +21,12 @@ N_EPISODES = 1000
 # Plans of a single recording, one for each block of time that is left out where it is judged.
 N_PLANS_OF_ONE_EPISODE = 100
 
-# A plan holds a wrong value if an action is this far from all others, and from the one before or after it in its plan.
+# An action of a plan is a wrong value if it is this many times farther from all other episodes than nine in ten actions
+# are, and as far, and at this many times the usual speed, from the action before or after it.
 _FAR = 5.0
 _USUAL_QUANTILE = 0.9
+_FASTEST = 3.0
+_USUAL_SPEED_QUANTILE = 0.95
 
 # A state is where the robot is if it is this near to the first action, in parts of the actions' range.
 _LARGEST_GAP = 0.25
@@ -134,14 +140,14 @@ class DemonstratedPlans:
         both = torch.cat([episodes, self.episodes.cpu().repeat_interleave(n_actions)])
         groups = group_numbers(len(both), both, torch.cat([frames, of_plans]))
         of_anchors, of_pieces = groups.split([len(episodes), len(of_plans)])
-        held_out = HeldOut(field.anchors.cpu(), of_anchors, periods)
+        judge = partial(field.to("cpu").without_own_group, groups_of_anchors=of_anchors)
         density = way_log_density(
-            lambda points, piece: held_out.judge(field.bandwidth, points, of_pieces[piece]).log_density,
+            lambda points, piece: judge(points, of_pieces[piece])[0],
             ways,
             field.bandwidth,
             periods,
         )  # (E, K)
-        is_judged = density.isfinite().all(dim=1) & ~_has_wrong_value(held_out, of_pieces, ways, field)
+        is_judged = density.isfinite().all(dim=1) & ~_has_wrong_value(judge, of_pieces, ways, field)
         middles = of_pieces.view(len(self), -1)[:, n_actions // 2]
         return self._one_each(density.amin(dim=1)[is_judged], middles[is_judged]).float()
 
@@ -187,10 +193,15 @@ def _chosen(episodes: Tensor, ranks: Tensor) -> Tensor:
     return order[is_first][:N_EPISODES]
 
 
-def _has_wrong_value(held_out: HeldOut, groups: Tensor, ways: Tensor, field: PotentialField) -> Tensor:
+def _has_wrong_value(
+    judge: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]],
+    groups: Tensor,
+    ways: Tensor,
+    field: PotentialField,
+) -> Tensor:
     """Whether an action of a plan is far from all other episodes, and from its neighbours in the plan, ``(E,)``."""
     actions = ways[:, 1:]  # (E, K, D)
-    distance = held_out.judge(field.bandwidth, actions.flatten(0, 1), groups).distance.view(len(ways), -1)
+    distance = judge(actions.flatten(0, 1), groups)[1].view(len(ways), -1)
     known = distance[distance.isfinite()]
     if not len(known):
         return torch.zeros(len(ways), dtype=torch.bool)
@@ -198,7 +209,10 @@ def _has_wrong_value(held_out: HeldOut, groups: Tensor, ways: Tensor, field: Pot
     steps = actions.diff(dim=1)
     if field.periods is not None:
         steps = wrap(steps, field.periods.cpu())
-    is_jump = steps.norm(dim=-1) > limit  # (E, K - 1)
+    speeds = steps.norm(dim=-1)  # (E, K - 1)
+    if not speeds.numel():
+        return torch.zeros(len(ways), dtype=torch.bool)
+    is_jump = speeds > max(limit, _FASTEST * speeds.quantile(_USUAL_SPEED_QUANTILE).item())
     edge = is_jump.new_zeros(len(ways), 1)
     beside_jump = torch.cat([edge, is_jump], dim=1) | torch.cat([is_jump, edge], dim=1)
     return ((distance > limit) & beside_jump).any(dim=1)

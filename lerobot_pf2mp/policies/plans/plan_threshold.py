@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from lerobot_pf2mp.potential_field import just_below
 from lerobot_pf2mp.potential_field.ways import conformal_threshold
 
 
@@ -29,4 +30,4 @@ class PlanThreshold:
     def of(cls, scores: Tensor, false_alarm_rate: float) -> PlanThreshold:
         """The threshold for the scores ``(n,)`` of demonstrated plans [nats]."""
         log_density, kept = conformal_threshold(scores, false_alarm_rate)
-        return cls(log_density, kept, len(scores))
+        return cls(just_below(log_density), kept, len(scores))
