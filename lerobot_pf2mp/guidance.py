@@ -3,8 +3,10 @@
 
 Both guides use lambda (`guidance_scale`) and agree in the limit of small lambda. Over a step of dt, one explicit step of
 lambda Phi moves an action by the share lambda dt / h^2 of its mean shift. `euler` takes that step as printed. With a
-share above 1 it overshoots: this is the sensitivity to lambda that the paper reports. `proximal` solves the same equation
-exactly over the step and cannot overshoot for any lambda.
+share above 1 it overshoots: this is the sensitivity to lambda that the paper reports. From 2 on it diverges, which is an
+error. `proximal` solves the same equation exactly over the step and cannot overshoot for any lambda.
+
+Where the field pulls only where support is missing (`PotentialField`), the share is that times the weight w(log p).
 
 They also differ in the point at which they evaluate the field (`guidance_point`). `euler` evaluates it at x_t, as
 printed. There the action still contains the noise that the flow will remove, so the guidance removes it a second time.
@@ -17,6 +19,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from decimal import ROUND_FLOOR, Context
 
 import torch
 from torch import Tensor
@@ -26,6 +29,9 @@ from lerobot_pf2mp.potential_field import PotentialField
 
 GUIDANCE_INTEGRATORS = ("euler", "proximal")
 GUIDANCE_POINTS = ("current", "end", "next")
+
+# The explicit step at its stability limit is one beyond it, however the two are rounded.
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -64,6 +70,9 @@ class GuidanceSettings:
 class EulerGuide:
     """Algorithm 2 as printed: x_{t+dt} = x_t + [v + lambda Phi(x_t)] dt.
 
+    It is stable for lambda dt / h^2 < 2. A call beyond that raises a ValueError, because its result would be far from
+    all demonstrations.
+
     Args:
         field: The potential field.
         scale: lambda >= 0.
@@ -76,6 +85,7 @@ class EulerGuide:
 
     def __call__(self, x_t: Tensor, x_next: Tensor, x_1: Tensor, dt: float) -> Tensor:
         """The guided step from the unguided one, all ``(..., D)`` [normalised]."""
+        _check_stability(self.scale, dt, self.field.bandwidth)
         a = _choose(self.point, x_t, x_next, x_1)
         return x_next + self.scale * dt * self.field.potential_gradient(a)
 
@@ -85,7 +95,8 @@ class ProximalGuide:
     """The guidance solved exactly over the step, after the flow's own step.
 
     With the local mean m held fixed, dx/dt = lambda (m - x) / h^2 has the solution
-    x = m + (x - m) exp(-lambda dt / h^2). The distance term pulls with constant strength lambda |alpha| and stops
+    x = m + (x - m) exp(-lambda dt / h^2). The weight w(log p(x)) of a field that pulls only where support is missing
+    multiplies that step. The distance term pulls with constant strength lambda |alpha| and stops
     at the safe set. Both are computed for the point at which the field is evaluated. Their offset is added to the step.
 
     Args:
@@ -102,8 +113,6 @@ class ProximalGuide:
         """The guided step from the unguided one, all ``(..., D)`` [normalised]."""
         share = 1 - math.exp(-self.scale * dt / self.field.bandwidth**2)
         a = _choose(self.point, x_t, x_next, x_1)
-        if self.field.alpha == 0:
-            return x_next + share * self.field.mean_shift(a)
         max_distance = self.scale * -self.field.alpha * dt
         return x_next + self.field.step_to_safety(a, share, max_distance)
 
@@ -137,6 +146,24 @@ class _OnDimensions:
         a_t, a_next, a_1 = (x.index_select(-1, self.dims) for x in (x_t, x_next, x_1))
         guided = self.guide(a_t, a_next, a_1, dt)
         return x_next.index_copy(-1, self.dims, guided.to(x_next.dtype))
+
+
+def _check_stability(scale: float, dt: float, bandwidth: float) -> None:
+    if _is_stable(scale, dt, bandwidth):
+        return
+    round_down = Context(prec=3, rounding=ROUND_FLOOR)
+    largest = round_down.create_decimal_from_float(2 * bandwidth**2 / dt)
+    if not _is_stable(float(largest), dt, bandwidth):  # the limit itself
+        largest = largest.next_minus(round_down)
+    raise ValueError(
+        "guidance_integrator=euler diverges unless guidance_scale * dt / bandwidth^2 is below 2, got "
+        f"{scale:g} * {dt:g} / {bandwidth:g}^2 = {scale * dt / bandwidth**2:g}: set guidance_scale to at most "
+        f"{float(largest):g}, or guidance_integrator=proximal, which is stable for every scale"
+    )
+
+
+def _is_stable(scale: float, dt: float, bandwidth: float) -> bool:
+    return scale * dt < 2 * bandwidth**2 * (1 - _ROUNDING)
 
 
 def _choose(point: str, x_t: Tensor, x_next: Tensor, x_1: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Policies and fields under ``torch.compile``."""
 
+import math
 from typing import Any
 
 import pytest
@@ -80,7 +81,7 @@ def noises(n: int) -> list[Tensor]:
     [
         ("fmp", {}),
         ("pf2mp", {}),
-        ("pf2mp", {"guidance_integrator": "euler"}),
+        ("pf2mp", {"guidance_integrator": "euler", "guidance_scale": 0.001}),
         ("pf2mp", {"field_alpha": 0.0}),
         ("pf2mp", {"field_action_dims": (0, 1)}),
         ("pf2mp", {"compile_model": True}),
@@ -186,4 +187,7 @@ def test_the_extensions_operators_are_proper_ones(n_angles: int) -> None:
     targets = KernelSums(paths(100, 2), 0.05, periods).tree._parts
     queries = paths(50, 2, seed=1)
     torch.library.opcheck(kernel_tree._sums_operator, (*parts, queries))
-    torch.library.opcheck(kernel_tree._steps_operator, (*parts, *targets, queries, 0.5, 0.3, 0.1))
+    for pull in ((math.inf, math.inf), (-1.0, 2.0)):
+        torch.library.opcheck(
+            kernel_tree._steps_operator, (*parts, *targets, queries, 0.5, 0.3, 0.1, *pull, 1.5)
+        )

@@ -233,6 +233,24 @@ def test_guidance_raises_the_log_density_of_the_actions(scheduler, integrator, p
     assert log_density(after).mean() > log_density(before).mean() + 0.5
 
 
+@pytest.mark.parametrize("n_steps", [1, 5])
+def test_the_limit_of_the_explicit_step_is_that_of_a_step_of_one_nth(n_steps):
+    limit = 2 * BANDWIDTH**2 * n_steps
+    for share in (0.99, 1.01):
+        policy = dppf(
+            num_inference_steps=n_steps,
+            guidance_scale=share * limit,
+            guidance_integrator="euler",
+            field_bandwidth=BANDWIDTH,
+        )
+        batch = {**observations(policy), POTENTIAL_FIELD: demonstrations(policy)}
+        if share < 1:
+            assert chunk_of(policy, batch, noise_for()).isfinite().all()
+        else:
+            with pytest.raises(ValueError, match="guidance_integrator=euler diverges unless"):
+                chunk_of(policy, batch, noise_for())
+
+
 @pytest.mark.parametrize(("integrator", "kind"), [("euler", EulerGuide), ("proximal", ProximalGuide)])
 @pytest.mark.parametrize("point", [None, *GUIDANCE_POINTS])
 def test_the_configured_guide_is_made_over_the_field_of_the_batch(integrator, kind, point):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import copy
 import math
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -113,15 +114,37 @@ def test_the_proximal_step_stays_among_the_anchors_however_large_lambda(scale):
     assert ((guided @ directions).amax(dim=0) <= reach + 1e-4).all()
 
 
-def test_the_euler_guide_diverges_where_the_proximal_one_does_not():
-    field, x_0 = random_field(), torch.randn(50, 2)
-    for scale in (1.0, 1e6):
-        euler, proximal = (
-            integrate(lambda x, t: -x, x_0, 5, guide=guide_of(field, scale, name))
-            for name in ("euler", "proximal")
-        )
-        assert not (euler.abs().amax() < 100)
-        assert proximal.abs().amax() <= field.anchors.abs().amax() + 1e-4
+@pytest.mark.parametrize("n_steps", [1, 5, 20])
+def test_an_explicit_step_beyond_its_limit_diverges_so_the_euler_guide_refuses_it(n_steps):
+    field, x_0, dt = random_field(), torch.randn(50, 2), 1 / n_steps
+    limit = 2 * field.bandwidth**2 / dt
+    a, x = field.anchors[:1], field.anchors[:1] + 1e-3
+    alone = PotentialField(a, field.bandwidth)
+    for scale, diverges in ((0.99 * limit, False), (1.01 * limit, True)):
+        moved = x + scale * dt * alone.potential_gradient(x)
+        assert ((moved - a).norm() > (x - a).norm()) == diverges
+    below = integrate(lambda x, t: -x, x_0, n_steps, guide=guide_of(field, 0.99 * limit, "euler"))
+    assert below.abs().amax() < 10
+    for scale in (limit, 1.01 * limit, 1.0 + limit, 1e6):
+        with pytest.raises(
+            ValueError, match=r"guidance_scale \* dt / bandwidth\^2 is below 2, got .*proximal"
+        ):
+            integrate(lambda x, t: -x, x_0, n_steps, guide=guide_of(field, scale, "euler"))
+        proximal = integrate(lambda x, t: -x, x_0, n_steps, guide=guide_of(field, scale))
+        assert proximal.abs().amax() <= max(field.anchors.abs().amax(), x_0.abs().amax()) + 1e-4
+
+
+@pytest.mark.parametrize("dt", [1.0, 0.2, 1 / 7, 0.01])
+@pytest.mark.parametrize("bandwidth", [0.1, 0.2, 0.0153, 0.25, 1e-4, 3.0])
+def test_the_largest_scale_that_the_error_names_is_accepted_and_close_to_the_limit(bandwidth, dt):
+    field, x = random_field(bandwidth=bandwidth), torch.randn(5, 2)
+    with pytest.raises(ValueError, match="guidance_scale to at most") as error:
+        guide_of(field, 1e3 * bandwidth**2 / dt, "euler")(x, x, x, dt)
+    named = re.search(r"to at most (\S+), or guidance_integrator=proximal", str(error.value))[1]
+    limit = 2 * bandwidth**2 / dt
+    assert 0.98 * limit < float(named) < limit
+    assert guide_of(field, float(named), "euler")(x, x, x, dt).isfinite().all()
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 1e6])

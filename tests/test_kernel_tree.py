@@ -221,7 +221,9 @@ def test_the_extension_refuses_arrays_that_do_not_fit() -> None:
         with pytest.raises(ValueError, match="do not fit"):
             kernel_tree._kernel_tree.lead_to_targets(held, tree, queries, 0.0, queries.copy(), 1)
         with pytest.raises(ValueError, match="do not fit"):
-            kernel_tree._kernel_tree.step_to_targets(tree, held, queries, 0.0, 0.5, 0.1, queries.copy(), 1)
+            kernel_tree._kernel_tree.step_to_targets(
+                tree, held, queries, 0.0, 0.5, 0.1, (0.0, math.inf, 1.0), queries.copy(), 1
+            )
     for offsets, sums in (
         (queries[1:], log_sums),
         (queries, log_sums[1:]),
@@ -241,5 +243,13 @@ def test_the_extension_refuses_arrays_that_do_not_fit() -> None:
         kernel_tree._kernel_tree.lead_to_targets(held, held, queries, 0.0, queries[1:].copy(), 1)
     with pytest.raises(ValueError, match="do not fit"):
         kernel_tree._kernel_tree.order_points(queries, np.zeros(3, np.int64))
+    pull = 0.0, math.inf, 1.0
+    for trees in ((held, held[:-1]), (held[:-1], held), (held, [*held]), ((*held[:2], 1, *held[3:]), held)):
+        with pytest.raises(TypeError):
+            kernel_tree._kernel_tree.step_to_targets(*trees, queries, 0.0, 0.5, 0.1, pull, queries.copy(), 1)
+        with pytest.raises(TypeError):
+            kernel_tree._kernel_tree.lead_to_targets(*trees, queries, 0.0, queries.copy(), 1)
+    with pytest.raises(TypeError):
+        kernel_tree._kernel_tree.sum_kernels(held[:-1], queries, queries.copy(), log_sums, 1)
     with pytest.raises(TypeError, match="bytes-like"):  # not contiguous
         kernel_tree._kernel_tree.sum_kernels(held, queries, queries.copy().T, log_sums, 1)

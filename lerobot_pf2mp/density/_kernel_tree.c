@@ -23,7 +23,8 @@ image of an anchor counts. The code for angles, and that for labels of anchors, 
 #include <string.h>
 
 enum {
-    LANES = 16, /* floats in one vector */
+    INTERFACE = 2, /* counts changes of what Python calls here; kernel_tree.py names the one that it needs */
+    LANES = 16,    /* floats in one vector */
     VECTORS = 4,
     WIDTH = VECTORS * LANES, /* anchors of one leaf */
     GROUP = 16,              /* queries that walk together */
@@ -618,32 +619,48 @@ static int lead_all_to_targets(
     return has_memory;
 }
 
-/* Steps that cover a `share` of the offset to the local mean. Where the log sum there is not above the threshold, they
-   go on towards the nearest target, by at most `max_distance`. Returns false if memory runs out. */
+/* How strongly a density pulls: fully where its logarithm is at most `log_none - width`, not at all from `log_none` on. */
+typedef struct {
+    float log_normaliser; /* log density = log sum - log_normaliser */
+    float log_none, width;
+} Pull;
+
+/* The same operations in the same order as `Pull.weight`, so that both decide alike. NaN stays NaN. */
+static float weight_at(const Pull *pull, float log_sum) {
+    const float weight = (pull->log_none - (log_sum - pull->log_normaliser)) / pull->width;
+    return weight > 1.0f ? 1.0f : weight < 0.0f ? 0.0f : weight;
+}
+
+/* Steps that cover a `share` of the offset to the local mean, times the weight of the pull. Where the log sum there is
+   not above the threshold, they go on towards the nearest target, by at most `max_distance`. Returns false if memory
+   runs out. */
 static int step_all_to_targets(
     const Tree *tree, const Tree *targets, const float *queries, Py_ssize_t n, float threshold, float share,
-    float max_distance, float *steps, int n_threads
+    float max_distance, const Pull *pull, float *steps, int n_threads
 ) {
     const Py_ssize_t dim = tree->dim;
     float *log_sums = malloc((n + 1) * sizeof *log_sums);
     float *shifted = malloc((n * dim + 1) * sizeof *shifted), *offsets = malloc((n * dim + 1) * sizeof *offsets);
     int has_memory = log_sums && shifted && offsets && sum_all(tree, queries, n, steps, log_sums, n_threads);
     if (has_memory) {
-        const double gain = share * (2.0 - share) * M_LN2 * tree->exponent_per_square;
         for (Py_ssize_t i = 0; i < n; i++) {
+            const float own_share = share * weight_at(pull, log_sums[i]);
+            const double gain = own_share * (2.0 - own_share) * M_LN2 * tree->exponent_per_square;
             double square = 0.0;
             for (Py_ssize_t d = i * dim; d < (i + 1) * dim; d++) {
                 square += (double)steps[d] * steps[d];
-                steps[d] *= share;
+                steps[d] *= own_share;
                 shifted[d] = queries[d] + steps[d];
             }
             /* A mean shift raises the log density by at least this (Comaniciu and Meer 2002, Theorem 1). With angles
                this holds for the images that were nearest before; other ones raise it further. */
             log_sums[i] = (float)(log_sums[i] + gain * square);
         }
-        has_memory = lead_all_to_targets(tree, targets, shifted, n, log_sums, threshold, offsets, n_threads);
     }
-    for (Py_ssize_t i = 0; has_memory && i < n; i++) {
+    const int goes_on = max_distance > 0.0f;
+    if (has_memory && goes_on)
+        has_memory = lead_all_to_targets(tree, targets, shifted, n, log_sums, threshold, offsets, n_threads);
+    for (Py_ssize_t i = 0; has_memory && goes_on && i < n; i++) {
         double square = 0.0;
         for (Py_ssize_t d = i * dim; d < (i + 1) * dim; d++) square += (double)offsets[d] * offsets[d];
         const int is_far = square > (double)max_distance * max_distance;
@@ -663,11 +680,16 @@ typedef struct {
     float exponent_per_square, exponent_range;
 } HeldTree;
 
-#define HELD_TREE "(y*y*y*y*ff)"
-#define POINTERS_TO(held) \
-    &(held).leaves, &(held).boxes, &(held).centre, &(held).periods, &(held).exponent_per_square, \
-        &(held).exponent_range
+/* False, with an error of Python, if the tuple holds something else. A tree is read by a call of its own:
+   PyArg_ParseTuple has room for as many buffers as its own arguments, or 8, and does not count those in tuples. */
+static int hold(PyObject *tuple, HeldTree *held) {
+    return PyArg_ParseTuple(
+        tuple, "y*y*y*y*ff", &held->leaves, &held->boxes, &held->centre, &held->periods, &held->exponent_per_square,
+        &held->exponent_range
+    );
+}
 
+/* Nothing happens if it was not held. */
 static void release(HeldTree *held) {
     PyBuffer_Release(&held->leaves), PyBuffer_Release(&held->boxes);
     PyBuffer_Release(&held->centre), PyBuffer_Release(&held->periods);
@@ -714,16 +736,17 @@ static PyObject *order_points(PyObject *module, PyObject *args) {
 }
 
 static PyObject *sum_kernels(PyObject *module, PyObject *args) {
-    HeldTree held;
+    PyObject *tuple;
+    HeldTree held = {0};
     Py_buffer queries, offsets, log_sums;
     int n_threads;
     Tree tree;
-    if (!PyArg_ParseTuple(
-            args, HELD_TREE "y*w*w*i", POINTERS_TO(held), &queries, &offsets, &log_sums, &n_threads
-        ))
+    if (!PyArg_ParseTuple(args, "O!y*w*w*i", &PyTuple_Type, &tuple, &queries, &offsets, &log_sums, &n_threads))
         return NULL;
+    const int is_held = hold(tuple, &held);
     const Py_ssize_t n = n_floats(&log_sums);
-    const int fits = read_tree(&held, &tree) && n_floats(&queries) == n * tree.dim && offsets.len == queries.len;
+    const int fits = is_held && read_tree(&held, &tree) && n_floats(&queries) == n * tree.dim
+        && offsets.len == queries.len;
     int has_memory = 1;
     if (fits) {
         Py_BEGIN_ALLOW_THREADS;
@@ -731,21 +754,24 @@ static PyObject *sum_kernels(PyObject *module, PyObject *args) {
         Py_END_ALLOW_THREADS;
     }
     release(&held), PyBuffer_Release(&queries), PyBuffer_Release(&offsets), PyBuffer_Release(&log_sums);
-    return answer(fits, has_memory);
+    return is_held ? answer(fits, has_memory) : NULL;
 }
 
 static PyObject *sum_other_kernels(PyObject *module, PyObject *args) {
-    HeldTree held;
+    PyObject *tuple;
+    HeldTree held = {0};
     Py_buffer labels, queries, query_labels, log_sums, distances;
     int n_threads;
     Tree tree;
     if (!PyArg_ParseTuple(
-            args, HELD_TREE "y*y*y*w*w*i", POINTERS_TO(held), &labels, &queries, &query_labels, &log_sums,
-            &distances, &n_threads
+            args, "O!y*y*y*w*w*i", &PyTuple_Type, &tuple, &labels, &queries, &query_labels, &log_sums, &distances,
+            &n_threads
         ))
         return NULL;
+    const int is_held = hold(tuple, &held);
     const Py_ssize_t n = n_floats(&log_sums);
-    const int fits = read_tree(&held, &tree) && labels.len == tree.n_leaves * WIDTH * (Py_ssize_t)sizeof(int32_t)
+    const int fits = is_held && read_tree(&held, &tree)
+        && labels.len == tree.n_leaves * WIDTH * (Py_ssize_t)sizeof(int32_t)
         && n_floats(&queries) == n * tree.dim && query_labels.len == n * (Py_ssize_t)sizeof(int32_t)
         && distances.len == log_sums.len;
     int has_memory = 1;
@@ -759,20 +785,27 @@ static PyObject *sum_other_kernels(PyObject *module, PyObject *args) {
     }
     release(&held), PyBuffer_Release(&labels), PyBuffer_Release(&queries), PyBuffer_Release(&query_labels);
     PyBuffer_Release(&log_sums), PyBuffer_Release(&distances);
-    return answer(fits, has_memory);
+    return is_held ? answer(fits, has_memory) : NULL;
 }
 
 /* The arguments that the two functions below share. */
 typedef struct {
+    PyObject *tuple, *target_tuple;
     HeldTree held, held_targets;
     Tree tree, targets;
     Py_buffer queries, result;
     Py_ssize_t n;
+    int is_held;
 } Request;
 
+#define TREES "O!O!"
+#define POINTERS_TO_TREES(request) &PyTuple_Type, &(request).tuple, &PyTuple_Type, &(request).target_tuple
+
 static int read_request(Request *request) {
-    const int fits = read_tree(&request->held, &request->tree) && read_tree(&request->held_targets, &request->targets)
-        && request->tree.dim == request->targets.dim && n_floats(&request->queries) % request->tree.dim == 0
+    request->is_held = hold(request->tuple, &request->held) && hold(request->target_tuple, &request->held_targets);
+    const int fits = request->is_held && read_tree(&request->held, &request->tree)
+        && read_tree(&request->held_targets, &request->targets) && request->tree.dim == request->targets.dim
+        && n_floats(&request->queries) % request->tree.dim == 0
         && request->result.len == request->queries.len;
     request->n = fits ? n_floats(&request->queries) / request->tree.dim : 0;
     return fits;
@@ -783,13 +816,16 @@ static void release_request(Request *request) {
     PyBuffer_Release(&request->queries), PyBuffer_Release(&request->result);
 }
 
+static PyObject *answer_request(const Request *request, int fits, int has_memory) {
+    return request->is_held ? answer(fits, has_memory) : NULL;
+}
+
 static PyObject *lead_to_targets(PyObject *module, PyObject *args) {
-    Request request;
+    Request request = {0};
     float threshold;
     int n_threads, has_memory = 1;
     if (!PyArg_ParseTuple(
-            args, HELD_TREE HELD_TREE "y*fw*i", POINTERS_TO(request.held), POINTERS_TO(request.held_targets),
-            &request.queries, &threshold, &request.result, &n_threads
+            args, TREES "y*fw*i", POINTERS_TO_TREES(request), &request.queries, &threshold, &request.result, &n_threads
         ))
         return NULL;
     const int fits = read_request(&request);
@@ -802,29 +838,30 @@ static PyObject *lead_to_targets(PyObject *module, PyObject *args) {
         Py_END_ALLOW_THREADS;
     }
     release_request(&request);
-    return answer(fits, has_memory);
+    return answer_request(&request, fits, has_memory);
 }
 
 static PyObject *step_to_targets(PyObject *module, PyObject *args) {
-    Request request;
+    Request request = {0};
     float threshold, share, max_distance;
+    Pull pull;
     int n_threads, has_memory = 1;
     if (!PyArg_ParseTuple(
-            args, HELD_TREE HELD_TREE "y*fffw*i", POINTERS_TO(request.held), POINTERS_TO(request.held_targets),
-            &request.queries, &threshold, &share, &max_distance, &request.result, &n_threads
+            args, TREES "y*fff(fff)w*i", POINTERS_TO_TREES(request), &request.queries, &threshold, &share,
+            &max_distance, &pull.log_normaliser, &pull.log_none, &pull.width, &request.result, &n_threads
         ))
         return NULL;
     const int fits = read_request(&request);
     if (fits) {
         Py_BEGIN_ALLOW_THREADS;
         has_memory = step_all_to_targets(
-            &request.tree, &request.targets, request.queries.buf, request.n, threshold, share, max_distance,
+            &request.tree, &request.targets, request.queries.buf, request.n, threshold, share, max_distance, &pull,
             request.result.buf, n_threads
         );
         Py_END_ALLOW_THREADS;
     }
     release_request(&request);
-    return answer(fits, has_memory);
+    return answer_request(&request, fits, has_memory);
 }
 
 static PyMethodDef methods[] = {
@@ -843,5 +880,6 @@ static struct PyModuleDef module = {
 PyMODINIT_FUNC PyInit__kernel_tree(void) {
     PyObject *created = PyModule_Create(&module);
     if (created && PyModule_AddIntConstant(created, "LEAF_SIZE", WIDTH) < 0) Py_CLEAR(created);
+    if (created && PyModule_AddIntConstant(created, "INTERFACE", INTERFACE) < 0) Py_CLEAR(created);
     return created;
 }

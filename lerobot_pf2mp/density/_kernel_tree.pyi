@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 type Tree = tuple[NDArray, NDArray, NDArray, NDArray, float, float]
 
 LEAF_SIZE: int
+INTERFACE: int
 
 def order_points(points: NDArray, order: NDArray) -> None:
     """Fills `order` ``(N,)`` int64 so that each LEAF_SIZE successive points ``(N, D)`` are one leaf."""
@@ -43,10 +44,14 @@ def step_to_targets(
     threshold: float,
     share: float,
     max_distance: float,
+    pull: tuple[float, float, float],
     steps: NDArray,
     n_threads: int,
 ) -> None:
-    """Fills `steps` ``(Q, D)``, which cover a share of the offset to the local mean.
+    """Fills `steps` ``(Q, D)``, which cover a share of the offset to the local mean, times the weight of the pull.
+
+    The pull is (log_normaliser, log_none, width). Its weight is (log_none - (log sum - log_normaliser)) / width within
+    [0, 1].
 
     Where the log sum there is not above the threshold, they go on towards the nearest target, at most `max_distance`.
     """

@@ -15,9 +15,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lerobot_pf2mp.density.kernels import checked_periods, mean, without_angles, wrap
+from lerobot_pf2mp.density.pull import EVERYWHERE, Pull
+
+# The INTERFACE of the extension that this file calls. In an installation that only links to the source code the built
+# extension may be older.
+_INTERFACE = 2
 
 try:
     from lerobot_pf2mp.density import _kernel_tree
+
+    if vars(_kernel_tree).get("INTERFACE") != _INTERFACE:
+        _kernel_tree = None  # type: ignore[assignment]
 except ImportError:  # installed without a C compiler
     _kernel_tree = None  # type: ignore[assignment]
 
@@ -32,7 +40,7 @@ _SMALLEST_EXPONENT_PER_SQUARE, _LARGEST_EXPONENT_PER_SQUARE = 1e-30, 1e30
 
 
 def is_available() -> bool:
-    """Whether the C extension could be built."""
+    """Whether the C extension could be built, and is the one that belongs to this version."""
     return _kernel_tree is not None
 
 
@@ -193,6 +201,8 @@ class KernelTree:
         log_sum_threshold: float,
         share: float,
         max_distance: float,
+        pull: Pull = EVERYWHERE,
+        log_normaliser: float = 0.0,
     ) -> Tensor:
         """Steps towards the local mean, and from there towards the nearest target if the kernel sum there is small.
 
@@ -200,15 +210,26 @@ class KernelTree:
             targets: The tree of the target points, with the same periods.
             queries: ``(Q, D)`` float32.
             log_sum_threshold: Log sum at the end of the first part above which there is no part towards a target.
-            share: Fraction in [0, 1] of the offset to the local mean that a step covers.
-            max_distance: Largest length of the part of a step towards the nearest target.
+            share: Fraction in [0, 1] of the offset to the local mean that a step covers where the pull is full.
+            max_distance: Largest length of the part of a step towards the nearest target. 0: there is no such part, and
+                the targets do not matter.
+            pull: Its weight multiplies the share. It depends on the log density at the query.
+            log_normaliser: The log sum less the log density [nats].
 
         Returns:
             ``(Q, D)`` the steps from the queries.
         """
         if torch.compiler.is_compiling():
             return _steps_operator(
-                *self._parts, *targets._parts, queries, log_sum_threshold, share, max_distance
+                *self._parts,
+                *targets._parts,
+                queries,
+                log_sum_threshold,
+                share,
+                max_distance,
+                pull.log_full,
+                pull.log_none,
+                log_normaliser,
             )
         queries = queries.contiguous()
         steps = torch.empty_like(queries)
@@ -219,6 +240,7 @@ class KernelTree:
             log_sum_threshold,
             share,
             max_distance,
+            (log_normaliser, pull.log_none, pull.width),
             steps.numpy(),
             torch.get_num_threads(),
         )
@@ -283,6 +305,9 @@ def _steps_operator(
     log_sum_threshold: float,
     share: float,
     max_distance: float,
+    log_full: float,
+    log_none: float,
+    log_normaliser: float,
 ) -> Tensor:
     targets = KernelTree(
         target_leaves,
@@ -293,7 +318,8 @@ def _steps_operator(
         target_exponent_range,
     )
     tree = KernelTree(leaves, boxes, centre, periods, exponent_per_square, exponent_range)
-    return tree.steps_to(targets, queries, log_sum_threshold, share, max_distance)
+    pull = Pull(log_full, log_none)
+    return tree.steps_to(targets, queries, log_sum_threshold, share, max_distance, pull, log_normaliser)
 
 
 @_steps_operator.register_fake

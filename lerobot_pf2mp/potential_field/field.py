@@ -5,7 +5,7 @@ Everything lives in the space in which the policy generates (normalised actions)
 actions drawn at random, and a bandwidth h:
 
     density       p(a)   = 1/M sum_i N(a; x_i, h^2 I)                      Gaussian KDE, Eq. 6
-    potential     phi(a) = log p(a) + alpha d(a, H),  alpha <= 0           Eq. 10; larger is safer
+    potential     phi(a) = log p(a) + alpha d(a, H),  alpha <= 0           Eq. 10; larger is safer (see `PotentialField`)
     safe set      H      = {a : log p(a) > log_threshold}                  a quantile of actions that p does not know
     gradient      Phi(a) = grad phi(a)                                     Eq. 11, points to safety
 
@@ -26,6 +26,7 @@ from lerobot_pf2mp.density.bandwidth import check_bandwidth
 from lerobot_pf2mp.density.kernel_sums import KernelSums
 from lerobot_pf2mp.density.kernel_tree import KernelTree
 from lerobot_pf2mp.density.kernels import offsets_to_nearest
+from lerobot_pf2mp.density.pull import Pull
 
 _TINY = torch.finfo(torch.float32).tiny
 
@@ -62,6 +63,10 @@ def check_periods(periods: Tensor, dim: int) -> None:
 class PotentialField:
     """A Gaussian KDE over demonstrated actions, and the potential built on it.
 
+    The potential is phi(a) = psi(log p(a)) + alpha d(a, H). By default psi(l) is l, as in the paper. With `log_full_pull`
+    and `log_no_pull` the density pulls only where support is missing: psi rises with slope 1 up to the first, ever less
+    from there to the second, and no further (see `Pull`). `log_density`, `mean_shift` and `score` know nothing of that.
+
     All methods accept queries of any batch shape ``(..., D)`` on the anchors' device, compute in float32 with
     autocast off, need no autograd, are finite everywhere and hold O(anchors + queries) memory.
 
@@ -74,6 +79,9 @@ class PotentialField:
             x and x + period are the same, and differences are the short way round.
         anchor_is_safe: ``(M,)`` bool, the anchors that count as points of H; None for those whose density, with their
             own kernel, is above the threshold.
+        log_full_pull: Log density up to which the density pulls fully [nats].
+        log_no_pull: Log density from which on it does not pull [nats]; in between the pull falls linearly in log p. Both
+            infinite: it pulls fully everywhere.
 
     Raises:
         ValueError: If an argument breaks one of these rules.
@@ -99,6 +107,7 @@ class PotentialField:
         if math.isnan(self.log_threshold):
             raise ValueError("log_threshold must be a number, got nan")
         check_alpha(self.alpha)
+        _ = self._pull
         object.__setattr__(self, "anchors", self.anchors.detach().float().contiguous())
         if self.periods is not None:
             check_periods(self.periods, self.anchors.shape[1])
@@ -227,12 +236,12 @@ class PotentialField:
 
     @torch.no_grad()
     def step_to_safety(self, a: Tensor, share: float, max_distance: float) -> Tensor:
-        """The step that moves an action towards its local mean, and from there towards the safe set H.
+        """The step share w(log p(a)) (m(a) - a) towards the local mean, and from its end towards the safe set H.
 
         Args:
             a: ``(..., D)`` actions [normalised].
-            share: Fraction of the mean shift that the step covers, in [0, 1].
-            max_distance: Largest length of the second part, towards H [normalised].
+            share: Fraction of the mean shift that the step covers where the pull is full (w = 1), in [0, 1].
+            max_distance: Largest length of the second part, towards H [normalised]; 0 leaves it out.
 
         Returns:
             ``(..., D)`` steps [normalised].
@@ -240,16 +249,21 @@ class PotentialField:
         queries = self._flatten(a)
         if self._sums.has_tree:
             tree, log_sum = self._sums.tree, self._log_sum_threshold
-            steps = tree.steps_to(self._safe_tree, queries, log_sum, share, max_distance)
+            targets = self._safe_tree if max_distance > 0 else tree
+            steps = tree.steps_to(
+                targets, queries, log_sum, share, max_distance, self._pull, self._log_normaliser
+            )
         else:
-            steps = share * self.mean_shift(queries)
-            offset = self.offset_to_safe_set(queries + steps)
-            distance = offset.norm(dim=-1, keepdim=True).clamp_min(max(max_distance, _TINY))
-            steps = steps.addcdiv_(offset, distance, value=max_distance)
+            log_density, shifts = self.log_density_and_mean_shift(queries)
+            steps = share * self._pull.weighted(shifts, log_density)
+            if max_distance > 0:
+                offset = self.offset_to_safe_set(queries + steps)
+                distance = offset.norm(dim=-1, keepdim=True).clamp_min(max(max_distance, _TINY))
+                steps = steps.addcdiv_(offset, distance, value=max_distance)
         return steps.reshape(a.shape)
 
     def potential(self, a: Tensor) -> Tensor:
-        """The potential phi(a) = log p(a) + alpha d(a, H); larger is safer.
+        """The potential phi(a) = psi(log p(a)) + alpha d(a, H); larger is safer.
 
         Args:
             a: ``(..., D)`` actions [normalised].
@@ -257,13 +271,13 @@ class PotentialField:
         Returns:
             ``(...)`` potentials [nats].
         """
-        phi = self.log_density(a)
+        phi = self._pull.integral(self.log_density(a))
         if self.alpha != 0:
             phi = phi + self.alpha * self.offset_to_safe_set(a).norm(dim=-1)
         return phi
 
     def potential_gradient(self, a: Tensor) -> Tensor:
-        """The potential field Phi(a) = grad phi(a) of Eq. 11, one row for each action.
+        """The potential field Phi(a) = grad phi(a) = w(log p(a)) grad log p(a) + alpha grad d(a, H) of Eq. 11.
 
         Args:
             a: ``(..., D)`` actions [normalised].
@@ -271,7 +285,8 @@ class PotentialField:
         Returns:
             ``(..., D)`` gradients [1/normalised], pointing to safety.
         """
-        gradient = self.score(a)
+        log_density, shifts = self.log_density_and_mean_shift(a)
+        gradient = self._pull.weighted(shifts, log_density) / self.bandwidth**2
         if self.alpha != 0:
             offset = self.offset_to_safe_set(a)
             direction = offset / offset.norm(dim=-1, keepdim=True).clamp_min(_TINY)
@@ -281,6 +296,10 @@ class PotentialField:
     @cached_property
     def _sums(self) -> KernelSums:
         return KernelSums(self.anchors, self.bandwidth, self.periods)
+
+    @cached_property
+    def _pull(self) -> Pull:
+        return Pull(self.log_full_pull, self.log_no_pull)
 
     @cached_property
     def _log_normaliser(self) -> float:
