@@ -258,7 +258,9 @@ def _observe_plans(
     frames, episodes = (
         torch.from_numpy(np.array(numbers[key])).reshape(-1) for key in ("index", "episode_index")
     )
-    chosen = choose_plans_of_episodes(episodes, frames, getattr(config, "drop_n_last_frames", 0))
+    n_actions = len(delta) + int(delta[0])  # from the current step on
+    n_dropped = min(cast(Any, config).drop_n_last_frames, n_actions - 1)
+    chosen = choose_plans_of_episodes(episodes, frames, n_dropped)
     if not len(chosen):
         return
     # LeRobot continues a chunk beyond its episode with copies of the first or last action.

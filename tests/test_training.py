@@ -137,7 +137,7 @@ def evaluations(checkpoint: Path, folder: Path) -> dict[str, Evaluation]:
         for name, options in {
             "sync": ["--eval.use_async_envs=false"],
             "async": ["--eval.use_async_envs=true"],
-            "unguided": ["--eval.use_async_envs=false", "--policy.guidance_scale=0"],
+            "unguided": ["--eval.use_async_envs=false", "--policy.guidance_scale=0", "--policy.max_plans=1"],
         }.items()
     }
 
@@ -161,14 +161,14 @@ def test_a_reloaded_checkpoint_acts_like_the_policy_that_was_saved(checkpoint: P
         "observation.environment_state": torch.rand(4, 2),
     }
     noise = torch.randn(4, 16, 2)
-    policy, preprocess, postprocess = load_policy(checkpoint, device="cpu")
+    policy, preprocess, postprocess = load_policy(checkpoint, device="cpu", max_plans=1)
     in_memory = postprocess(policy.predict_action_chunk(preprocess(dict(batch)), noise=noise))
     for part in (policy, preprocess, postprocess):
         part.save_pretrained(tmp_path)
     policy, preprocess, postprocess = load_policy(tmp_path, device="cpu")
     reloaded = postprocess(policy.predict_action_chunk(preprocess(dict(batch)), noise=noise))
     assert torch.equal(in_memory, reloaded)
-    unguided, preprocess, postprocess = load_policy(checkpoint, device="cpu", guidance_scale=0)
+    unguided, preprocess, postprocess = load_policy(checkpoint, device="cpu", guidance_scale=0, max_plans=1)
     assert not torch.equal(
         in_memory, postprocess(unguided.predict_action_chunk(preprocess(dict(batch)), noise=noise))
     )
@@ -183,13 +183,15 @@ def test_guidance_scale_zero_on_the_command_line_is_fmp(
     kept = {
         k: v
         for k, v in config.items()
-        if not k.startswith(("guidance_", "field_", "n_field_", "on_unsupported"))
+        if not k.startswith(
+            ("guidance_", "field_", "n_field_", "max_plans", "false_alarm_rate", "on_unsupported")
+        )
     }
     (as_fmp / "config.json").write_text(json.dumps({**kept, "type": "fmp"}))
     batch = {"observation.state": torch.rand(4, 2), "observation.environment_state": torch.rand(4, 2)}
     noise = torch.randn(4, 16, 2)
     chunks = []
-    for path, overrides in ((as_fmp, {}), (checkpoint, {"guidance_scale": 0})):
+    for path, overrides in ((as_fmp, {}), (checkpoint, {"guidance_scale": 0, "max_plans": 1})):
         policy, preprocess, _ = load_policy(path, device="cpu", **overrides)
         chunks.append(policy.predict_action_chunk(preprocess(dict(batch)), noise=noise))
     assert torch.equal(*chunks)

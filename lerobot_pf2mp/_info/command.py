@@ -5,16 +5,27 @@ from __future__ import annotations
 
 import math
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import version
 
+from .checkpoint import checkpoint_lines
 from .probes import DISTRIBUTION
 from .report import as_json, as_row, gather, is_well, verdict
 
 
 @dataclass
+class CheckpointConfig:
+    """A checkpoint to report on."""
+
+    # Its pretrained_model folder, or a repository on the Hub.
+    path: str = ""
+
+
+@dataclass
 class InfoConfig:
     """Reports what is installed, whether LeRobot finds this package, what works here, and how to repair the rest.
+
+    With --policy.path it reports what a checkpoint holds instead: its potential field, and how its plans are checked.
 
     Each line ends in ok, optional (missing, but needed only for the feature that the line names) or problem. The exit code
     is 0 if there is no problem, else 1.
@@ -22,12 +33,15 @@ class InfoConfig:
     Examples:
         pf2mp-info
         pf2mp-info --json=true > info.json
+        pf2mp-info --policy.path=outputs/MazeLarge-v0/pf2mp_0/checkpoints/last/pretrained_model
     """
 
     # Whether to write JSON, for issue reports, instead of a table.
     json: bool = False
     # Largest duration of each trial [s].
     time_limit: float = 120.0
+    # A checkpoint to report on instead.
+    policy: CheckpointConfig = field(default_factory=CheckpointConfig)
 
 
 def main() -> None:
@@ -38,7 +52,8 @@ def main() -> None:
     config = _parsed()
     lines = []
     try:
-        for line in gather(config.time_limit):
+        path = config.policy.path
+        for line in checkpoint_lines(path) if path else gather(config.time_limit):
             lines.append(line)
             if not config.json:
                 print(as_row(line), flush=True)

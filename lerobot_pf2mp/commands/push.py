@@ -68,7 +68,7 @@ def _loaded_facts(path: Path) -> PolicyFacts:
         OSError: If it cannot be read.
     """
     from lerobot_pf2mp.hub.model_card import POLICY_NAMES
-    from lerobot_pf2mp.loading import load_config, load_policy, loaded_field
+    from lerobot_pf2mp.loading import load_config, load_policy, loaded_demonstrations, loaded_field
     from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
     from lerobot_pf2mp.policies.model_card import policy_facts
 
@@ -78,6 +78,7 @@ def _loaded_facts(path: Path) -> PolicyFacts:
     if config.type not in POLICY_NAMES:
         raise ValueError(f"the checkpoint's type must be one of {list(POLICY_NAMES)}, got {config.type!r}")
     _, preprocessor, _ = load_policy(path, device="cpu")
-    return policy_facts(
-        config, loaded_field(config, preprocessor) if isinstance(config, GuidedConfig) else None
-    )
+    if not isinstance(config, GuidedConfig):
+        return policy_facts(config, None)
+    loaded_field(config, preprocessor)  # raises an error if it is missing, although guidance may be off
+    return policy_facts(config, loaded_demonstrations(preprocessor))

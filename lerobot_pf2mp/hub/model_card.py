@@ -38,10 +38,26 @@ _GUIDED = (
 _LIMITS = (
     "Obstacles must be where they were in the demonstrations, and demonstrations must cover the free space that is needed: "
     "what was never visited counts as unsafe.",
-    "The field sees single actions, not the path from one to the next.",
+    "The check sees the straight way between actions, as they are planned. A robot that does not follow them exactly may "
+    "touch what the demonstrations passed closely.",
     "It is guidance, not a guarantee: collisions become rare, not impossible. Do not rely on it where people could be hurt.",
 )
 _UNGUIDED_LIMITS = ("It imitates the demonstrations and knows nothing of obstacles or of limits of a robot.",)
+
+
+@dataclass(frozen=True)
+class PlanFacts:
+    """The facts about the check of plans.
+
+    Args:
+        log_threshold: Smallest log density that the way of a plan may have [nats].
+        false_alarm_rate: Largest probability with which a plan as good as a fresh demonstration is flagged.
+        n_plans: Number of demonstrated plans from which that follows.
+    """
+
+    log_threshold: float
+    false_alarm_rate: float
+    n_plans: int
 
 
 @dataclass(frozen=True)
@@ -57,6 +73,11 @@ class GuidanceFacts:
         bandwidth_rule: The rule by which the bandwidth was chosen; None for a given number.
         bandwidth: The bandwidth h [normalised action units]; None if the field is not fitted.
         n_anchors: The number M of anchors; None if the field is not fitted.
+        region: Where the field pulls: everywhere, unsupported or fading.
+        quantile: The quantile of demonstrated actions' densities above which it does not; of no meaning for everywhere.
+        max_plans: Largest number of plans that are drawn for one that is executed.
+        on_unsupported: What happens if the best of them leaves the demonstrated region.
+        plans: How plans are calibrated; None if they are not.
     """
 
     scale: float
@@ -67,6 +88,11 @@ class GuidanceFacts:
     bandwidth_rule: str | None
     bandwidth: float | None = None
     n_anchors: int | None = None
+    region: str = "everywhere"
+    quantile: float = 0.5
+    max_plans: int = 1
+    on_unsupported: str = "ignore"
+    plans: PlanFacts | None = None
 
 
 @dataclass(frozen=True)
@@ -253,6 +279,8 @@ def _describe_guidance(guidance: GuidanceFacts) -> list[tuple[str, str]]:
     rows = [
         ("guidance strength lambda", f"{guidance.scale:g}"),
         ("guidance integrator", f"{guidance.integrator}{point}"),
+        ("guidance region", _describe_region(guidance)),
+        ("plans", _describe_plans(guidance)),
     ]
     if guidance.bandwidth is None:
         return rows
@@ -264,6 +292,27 @@ def _describe_guidance(guidance: GuidanceFacts) -> list[tuple[str, str]]:
         ("action dimensions of the field", ", ".join(map(str, guidance.action_dims))),
         ("distance term alpha", f"{guidance.alpha:g}"),
     ]
+
+
+def _describe_region(guidance: GuidanceFacts) -> str:
+    below = f"the {100 * guidance.quantile:g} % quantile of demonstrated actions"
+    return {
+        "everywhere": "everywhere",
+        "unsupported": f"where the density is below {below}",
+        "fading": f"fully outside the safe set, fading to nothing at {below}",
+    }[guidance.region]
+
+
+def _describe_plans(guidance: GuidanceFacts) -> str:
+    if guidance.plans is None:
+        return "not checked"
+    plans = guidance.plans
+    more = f", and drawn again up to {guidance.max_plans - 1} times" if guidance.max_plans > 1 else ""
+    return (
+        f"flagged if the log density on their way is below {plans.log_threshold:.4g}, which happens to at most "
+        f"{100 * plans.false_alarm_rate:.2g} % of plans as good as a demonstration ({plans.n_plans} demonstrated plans)"
+        f"{more}; what stays flagged: {guidance.on_unsupported}"
+    )
 
 
 def _results(facts: CardFacts) -> list[str]:

@@ -9,10 +9,17 @@ from typing import Any
 
 from huggingface_hub import ModelCard
 
-from lerobot_pf2mp.hub.model_card import CardFacts, GuidanceFacts, PolicyFacts, env_options, make_model_card
+from lerobot_pf2mp.hub.model_card import (
+    CardFacts,
+    GuidanceFacts,
+    PlanFacts,
+    PolicyFacts,
+    env_options,
+    make_model_card,
+)
 from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
+from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
 from lerobot_pf2mp.policies.guided.field_guidance import FieldGuidance
-from lerobot_pf2mp.potential_field import PotentialField
 
 
 class WithModelCard:
@@ -36,7 +43,7 @@ class WithModelCard:
         """The card. The arguments are those of LeRobot's `PreTrainedPolicy.generate_model_card`."""
         training = {} if cfg is None else cfg.to_dict()
         facts = CardFacts(
-            policy=policy_facts(self.config, self._trained_field(), license, tags),
+            policy=policy_facts(self.config, self._trained_demonstrations(), license, tags),
             repo_id=self.config.repo_id or f"you/your_{model_type}",
             dataset=dataset_repo_id,
             dataset_size=dataset_meta and (dataset_meta.total_episodes, dataset_meta.total_frames),
@@ -45,19 +52,15 @@ class WithModelCard:
         )
         return make_model_card(facts)
 
-    def _trained_field(self) -> PotentialField | None:
-        """The field of the actions on which the policy was just trained; None without a fitted field."""
+    def _trained_demonstrations(self) -> DemonstratedActions | None:
+        """The actions on which the policy was just trained; None if it has not been, or has no field."""
         guidance: FieldGuidance | None = getattr(self, "guidance", None)
-        demonstrations = None if guidance is None else guidance.demonstrations
-        if demonstrations is not None:
-            with suppress(ValueError):  # not fitted, for example after a training of 0 steps
-                return demonstrations.field(self.config.field_settings)
-        return None
+        return None if guidance is None else guidance.demonstrations
 
 
 def policy_facts(
     config: Any,
-    field: PotentialField | None,
+    demonstrations: DemonstratedActions | None,
     license: str | None = None,
     tags: Sequence[str] | None = None,
 ) -> PolicyFacts:
@@ -65,7 +68,7 @@ def policy_facts(
 
     Args:
         config: Its configuration.
-        field: Its potential field; None without a fitted field.
+        demonstrations: What its potential field is fitted to; None without a field.
         license: Name of the licence; None for that of the configuration.
         tags: More tags; None for those of the configuration.
     """
@@ -80,7 +83,7 @@ def policy_facts(
         horizon=config.horizon,
         n_action_steps=config.n_action_steps,
         num_inference_steps=config.num_inference_steps or config.num_train_timesteps,
-        guidance=_guidance_facts(config, field, outputs["action"][0])
+        guidance=_guidance_facts(config, demonstrations, outputs["action"][0])
         if isinstance(config, GuidedConfig)
         else None,
         license=license or config.license,
@@ -88,7 +91,19 @@ def policy_facts(
     )
 
 
-def _guidance_facts(config: GuidedConfig, field: PotentialField | None, action_dim: int) -> GuidanceFacts:
+def _guidance_facts(
+    config: Any, demonstrations: DemonstratedActions | None, action_dim: int
+) -> GuidanceFacts:
+    field, plans = None, None
+    if demonstrations is not None:
+        with suppress(ValueError):  # not fitted, for example after a training of 0 steps
+            field = demonstrations.field(config.field_settings)
+    if demonstrations is not None and field is not None and config.checks_plans:
+        with suppress(ValueError):  # a field of before has no demonstrated plans
+            threshold = demonstrations.plan_threshold(
+                config.field_settings, config.n_action_steps, config.false_alarm_rate
+            )
+            plans = PlanFacts(threshold.log_density, threshold.false_alarm_rate, threshold.n_plans)
     return GuidanceFacts(
         scale=config.guidance_scale,
         integrator=config.guidance_integrator,
@@ -98,4 +113,9 @@ def _guidance_facts(config: GuidedConfig, field: PotentialField | None, action_d
         bandwidth_rule=config.field_bandwidth if isinstance(config.field_bandwidth, str) else None,
         bandwidth=None if field is None else field.bandwidth,
         n_anchors=None if field is None else len(field.anchors),
+        region=config.guidance_region,
+        quantile=config.guidance_quantile,
+        max_plans=config.max_plans,
+        on_unsupported=config.on_unsupported,
+        plans=plans,
     )

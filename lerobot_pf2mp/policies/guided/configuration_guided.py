@@ -85,6 +85,11 @@ class GuidedConfig:
         )
 
     @property
+    def checks_plans(self) -> bool:
+        """Whether anything depends on the check of plans."""
+        return self.max_plans > 1 or self.on_unsupported != "ignore"
+
+    @property
     def _field_dims(self) -> tuple[int, ...] | None:
         return None if self.field_action_dims is None else tuple(self.field_action_dims)
 

@@ -106,6 +106,7 @@ class DemonstratedActions:
         dataset_id: bytes = b"",
         n_past: int = 0,
         n_executed: int | None = None,
+        drop_n_last_frames: int = 0,
         states: Tensor | None = None,
         places: Tensor | None = None,
     ) -> None:
@@ -125,6 +126,7 @@ class DemonstratedActions:
                 sample starts.
             n_past: Number of a chunk's first actions that lie before the current step.
             n_executed: Number of actions from the current step on that the policy executes; None if the chunks are no plans.
+            drop_n_last_frames: Number of an episode's last frames with which no plan begins.
             states: ``(B, A)`` observed states at the current step [normalised]; None if there are none.
             places: ``(2, A)`` how states become actions, see `places_of_states`; None if it is unknown.
 
@@ -140,11 +142,15 @@ class DemonstratedActions:
         if unit is not None:
             self.recognise_angles(actions, is_pad, unit)
         if n_executed is not None and frames is not None and episodes is not None:
+            is_plan: Tensor | slice = slice(None)
+            if is_pad is not None:
+                n_left = (~is_pad[:, n_past:]).sum(dim=1)  # in the episode
+                is_plan = n_left > min(drop_n_last_frames, actions.shape[1] - n_past - 1)
             self.observe_plans(
-                actions[:, n_past:],
-                frames + n_past,
-                episodes,
-                states=states,
+                actions[is_plan, n_past:],
+                (frames + n_past)[is_plan],
+                episodes[is_plan],
+                states=None if states is None else states[is_plan],
                 places=places,
                 n_executed=n_executed,
             )
@@ -183,6 +189,8 @@ class DemonstratedActions:
             n_executed: As there.
         """
         self._n_executed = n_executed
+        if not len(actions):
+            return
         dims = self.settings.action_dims
         actions = _select_dims(actions.detach().float(), dims)
         start = actions[:, 0]

@@ -123,6 +123,7 @@ class FieldGuidance:
             dataset_id=self._dataset_id,
             n_past=-first,
             n_executed=self.config.n_action_steps,
+            drop_n_last_frames=self.config.drop_n_last_frames,
             states=states,
             places=self._places,
         )
@@ -191,7 +192,7 @@ class FieldGuidance:
             UnsupportedPlanError: See `react`.
         """
         config = self.config
-        is_checked = config.max_plans > 1 or config.on_unsupported != "ignore" or self.measures_plans
+        is_checked = config.checks_plans or self.measures_plans
         if torch.compiler.is_compiling() and POTENTIAL_FIELD not in batch:
             return require_finite(chunk, batch)  # one graph, for a guide that the caller made
         return self._choose(batch, chunk, draw_more, left_over, n_steps, is_checked)

@@ -48,8 +48,8 @@ class FieldSettings:
     leave_out: str = LEFT_OUT[0]
     angle_dims: tuple[int, ...] | None = None
     angle_period: float = 2 * math.pi
-    region: str = "everywhere"
-    quantile: float = 0.5
+    region: str = "fading"
+    quantile: float = 0.8
 
     def __post_init__(self) -> None:
         if self.n_points < 1:
