@@ -70,7 +70,12 @@ def write_checkpoint(folder: Path, kind: str, seed: int = 0) -> str:
     for step in preprocessor.steps:
         if isinstance(step, PotentialFieldProcessorStep):
             step.demonstrations.observe(
-                0.3 * torch.randn(4, 8, 2), None, None, settings=config.field_settings
+                0.3 * torch.randn(4, 8, 2),
+                None,
+                8 * torch.arange(4),
+                torch.arange(4),  # one chunk of each episode
+                settings=config.field_settings,
+                n_executed=config.n_action_steps,
             )
     for part in (policy, preprocessor, postprocessor):
         part.save_pretrained(folder)

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Records the info of every episode of a vectorised environment. LeRobot's evaluation keeps only rewards and success."""
+"""Records the info and plans of every episode of a vectorised environment.
+
+LeRobot's evaluation keeps only rewards and success.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from lerobot_pf2mp.benchmark.executed_plans import ExecutedPlans
+
 # The keys of an environment's info that are recorded, and how the values of all steps are combined.
 _OVER_STEPS: dict[str, Callable[[float, float], float]] = {
     "is_collision": max,
@@ -17,6 +22,9 @@ _OVER_STEPS: dict[str, Callable[[float, float], float]] = {
     "clearance": min,
     "path_length": max,
     "stroke_error": lambda _, latest: latest,
+    "plans_drawn": max,
+    "n_plans": max,
+    "is_plan_flagged": max,
 }
 
 
@@ -31,6 +39,9 @@ class Episode:
         steps: Control steps.
         plan_in_wall: Whether an action lay inside an obstacle (``is_plan_in_wall`` of any step).
         stroke_error: ``stroke_error`` at the end [m].
+        plans_drawn: Plans that the policy drew; None if it does not say.
+        n_plans: Plans of which actions were executed; None in the same case.
+        plan_flagged: Whether one of those still left the demonstrated region; None in the same case.
     """
 
     collision: bool | None
@@ -39,6 +50,9 @@ class Episode:
     steps: int
     plan_in_wall: bool | None = None
     stroke_error: float | None = None
+    plans_drawn: int | None = None
+    n_plans: int | None = None
+    plan_flagged: bool | None = None
 
 
 class EpisodeRecorder(gym.vector.VectorWrapper):
@@ -51,6 +65,7 @@ class EpisodeRecorder(gym.vector.VectorWrapper):
     def __init__(self, env: gym.vector.VectorEnv) -> None:
         super().__init__(env)
         self._finished: list[Episode] = []
+        self._plans: ExecutedPlans | None = None
         self._steps = np.zeros(env.num_envs, dtype=int)
         self._ended = np.ones(env.num_envs, dtype=bool)
         self._reported: list[dict[str, float]] = [{} for _ in range(env.num_envs)]
@@ -61,6 +76,13 @@ class EpisodeRecorder(gym.vector.VectorWrapper):
         # Gymnasium's wrapper does not forward `call` and `envs`, which LeRobot uses.
         return getattr(self.env, name)
 
+    def watch(self, policy: Any) -> None:
+        """Records also the plans of the policy that steps this environment, from the next reset on.
+
+        The info of each step then says what `ExecutedPlans.count` returns.
+        """
+        self._plans = ExecutedPlans(policy, self.num_envs)
+
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """Starts the next episodes. The episodes before count as finished."""
         self._finish()
@@ -68,6 +90,8 @@ class EpisodeRecorder(gym.vector.VectorWrapper):
         self._steps[:] = 0
         self._ended[:] = False
         self._reported = [{} for _ in range(self.num_envs)]
+        if self._plans is not None:
+            self._plans.forget()
         self._record(info)
         return observation, info
 
@@ -75,6 +99,8 @@ class EpisodeRecorder(gym.vector.VectorWrapper):
         """Steps all sub-environments; a sub-environment is not recorded after the end of its episode."""
         observation, reward, terminated, truncated, info = self.env.step(actions)
         self._steps += ~self._ended
+        if self._plans is not None:
+            info = {**info, **self._plans.count(~self._ended)}
         self._record(info)
         self._ended |= np.asarray(terminated) | np.asarray(truncated)
         return observation, reward, terminated, truncated, info
@@ -108,6 +134,9 @@ class EpisodeRecorder(gym.vector.VectorWrapper):
                     path_length=reported.get("path_length"),
                     stroke_error=reported.get("stroke_error"),
                     steps=steps,
+                    plans_drawn=_int_or_none(reported.get("plans_drawn")),
+                    n_plans=_int_or_none(reported.get("n_plans")),
+                    plan_flagged=_bool_or_none(reported.get("is_plan_flagged")),
                 )
             )
         self._steps[:] = 0
@@ -115,3 +144,7 @@ class EpisodeRecorder(gym.vector.VectorWrapper):
 
 def _bool_or_none(value: float | None) -> bool | None:
     return None if value is None else bool(value)
+
+
+def _int_or_none(value: float | None) -> int | None:
+    return None if value is None else int(value)

@@ -8,7 +8,7 @@ import statistics
 import subprocess
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import redirect_stderr
+from contextlib import contextmanager, redirect_stderr
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -24,8 +24,9 @@ from lerobot.scripts.lerobot_eval import eval_policy
 from lerobot_pf2mp.benchmark.episode_recorder import EpisodeRecorder
 from lerobot_pf2mp.benchmark.prior_noise import seeded_prior_noise
 from lerobot_pf2mp.benchmark.spec import BenchmarkSpec, Job
-from lerobot_pf2mp.loading import load_policy
+from lerobot_pf2mp.loading import load_policy, loaded_demonstrations
 from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
+from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
 from lerobot_pf2mp.process.worker_pool import worker_pool
 from lerobot_pf2mp.results.rows import EpisodeRow
 
@@ -68,16 +69,21 @@ class _Evaluator:
     def __call__(self, job: Job) -> list[EpisodeRow]:
         """Evaluates a job and returns the rows of its episodes."""
         spec = self._spec
-        policy, preprocessor, postprocessor = self._load(job.checkpoint, job.variant)
+        policy, preprocessor, postprocessor, max_plans = self._load(job.checkpoint, job.variant)
         env_config, env = self._make_env(job.task)
+        measures_plans = False
         if isinstance(policy.config, GuidedConfig):
-            policy.config.guidance_scale = job.guidance.scale
-            if job.guidance.scale:
-                policy.config.guidance_integrator = job.guidance.integrator
+            self._set_options(policy.config, job, max_plans)
+            measures_plans = _can_check_plans(policy.config, preprocessor, max_plans)
         env_preprocessor, env_postprocessor = make_env_pre_post_processors(env_config, policy.config)
         latency = _measure_latency(env, policy, env_preprocessor, preprocessor, spec.episode_seed)
+        env.watch(policy)
         # stderr gets LeRobot's own progress bars.
-        with seeded_prior_noise(policy, job.repeat), redirect_stderr(io.StringIO()):
+        with (
+            seeded_prior_noise(policy, job.repeat),
+            _measured_plans(policy, measures_plans),
+            redirect_stderr(io.StringIO()),
+        ):
             outcomes = eval_policy(
                 env,
                 policy,
@@ -109,12 +115,27 @@ class _Evaluator:
                 chunk_latency_ms=latency,
                 checkpoint=job.checkpoint,
                 commit=self._commit,
+                plans_drawn=episode.plans_drawn,
+                n_plans=episode.n_plans,
+                plan_flagged=episode.plan_flagged,
             )
             for number, (outcome, episode) in enumerate(zip(outcomes, episodes, strict=True))
         ]
 
-    def _load_policy(self, checkpoint: str, variant: str) -> tuple[Any, Any, Any]:
-        return load_policy(checkpoint, device=self._spec.device, **self._spec.variants[variant])
+    def _load_policy(self, checkpoint: str, variant: str) -> tuple[Any, Any, Any, int]:
+        """The policy, its processors, and its own ``max_plans``, which jobs may change in its configuration."""
+        policy, *processors = load_policy(
+            checkpoint, device=self._spec.device, **self._spec.variants[variant]
+        )
+        return policy, *processors, getattr(policy.config, "max_plans", 1)
+
+    def _set_options(self, config: Any, job: Job, max_plans: int) -> None:
+        config.guidance_scale = job.guidance.scale
+        if job.guidance.scale:
+            config.guidance_integrator = job.guidance.integrator
+        # Without guidance it is the plain policy, which executes the first plan that it draws.
+        is_plain = job.guidance.scale == 0 and "max_plans" not in self._spec.variants[job.variant]
+        config.max_plans = 1 if is_plain else max_plans
 
     def _make_vector_env(self, task: str) -> tuple[EnvConfig, EpisodeRecorder]:
         env_config = replace(self._spec.env, task=task)
@@ -137,6 +158,39 @@ def _work(job: Job) -> list[EpisodeRow]:
     return _worker(job)
 
 
+def _can_check_plans(config: Any, preprocessor: Any, max_plans: int) -> bool:
+    """Whether a guided policy has what its plans are checked with.
+
+    Raises:
+        ValueError: If it has a field that is not calibrated for plans, and is to draw plans again.
+    """
+    fields = [step for step in preprocessor.steps if isinstance(step, PotentialFieldProcessorStep)]
+    if not any(len(step.demonstrations) for step in fields):
+        return False
+    try:
+        loaded_demonstrations(preprocessor).plan_threshold(
+            config.field_settings, config.n_action_steps, config.false_alarm_rate
+        )
+    except ValueError:
+        if max_plans > 1:
+            raise
+        return False
+    return True
+
+
+@contextmanager
+def _measured_plans(policy: Any, is_on: bool) -> Iterator[None]:
+    """Makes a guided policy check every plan, also where it draws no other one, so that flagged plans are counted."""
+    if not is_on:
+        yield
+        return
+    policy.guidance.measures_plans = True
+    try:
+        yield
+    finally:
+        policy.guidance.measures_plans = False
+
+
 def _rounded(value: float | None, factor: float = 1) -> float | None:
     return None if value is None else round(factor * value, 6)
 
@@ -148,7 +202,11 @@ def _measure_latency(
     preprocessor: Any,
     episode_seed: int,
 ) -> float:
-    """The median time of a call that generates a new chunk for one robot [ms]."""
+    """The median time of a call that generates a new chunk for one robot [ms].
+
+    It is what a user waits for: also for the check of the plan and for other plans, if the policy itself does that. A
+    check that only the benchmark asks for is left out, because it is switched on later.
+    """
     policy.eval()
     observation, _ = env.reset(
         seed=[episode_seed + i for i in range(env.num_envs)], options={NEW_ROLLOUT_OPTION: True}

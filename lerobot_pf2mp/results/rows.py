@@ -38,6 +38,9 @@ class EpisodeRow:
             each policy, kind of guidance and repeat.
         checkpoint: Folder or repository from which the policy was loaded.
         commit: Commit of this package; empty if unknown.
+        plans_drawn: Plans that the policy drew in the episode; None, as for the next two, if they were not measured.
+        n_plans: Plans (chunks) of which actions were executed.
+        plan_flagged: Whether one of those still left the demonstrated region.
     """
 
     task: str
@@ -58,6 +61,10 @@ class EpisodeRow:
     chunk_latency_ms: float | None
     checkpoint: str
     commit: str
+    # Files of before have no columns for what has a default.
+    plans_drawn: int | None = None
+    n_plans: int | None = None
+    plan_flagged: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -85,6 +92,10 @@ class SummaryRow:
         chunk_latency_ms: Time to generate one chunk [ms].
         checkpoint: Folder or repository from which the policy was loaded.
         commit: Commit of this package.
+        plans_drawn: Plans drawn in all episodes; None, as for the next three, if they were not measured.
+        n_plans: Plans executed in all episodes.
+        flagged: Episodes in which a plan was executed that left the demonstrated region.
+        flagged_collisions: Those of them with a collision; None also if the environment does not report them.
     """
 
     task: str
@@ -106,6 +117,11 @@ class SummaryRow:
     chunk_latency_ms: float | None
     checkpoint: str
     commit: str
+    # As above.
+    plans_drawn: int | None = None
+    n_plans: int | None = None
+    flagged: int | None = None
+    flagged_collisions: int | None = None
 
 
 def write_rows(path: Path, rows: Sequence[EpisodeRow] | Sequence[SummaryRow], row_type: type) -> None:
@@ -122,7 +138,7 @@ def format_row(row: EpisodeRow | SummaryRow) -> list[str]:
 
 
 def read_rows[Row](path: Path, row_type: type[Row]) -> list[Row]:
-    """Reads rows from CSV, leaving out a last line that was cut off.
+    """Reads rows from CSV, leaving out a last line that was cut off. Columns that the file does not have yet are None.
 
     Args:
         path: The file.
@@ -132,11 +148,19 @@ def read_rows[Row](path: Path, row_type: type[Row]) -> list[Row]:
         ValueError: If the file's columns are not those of the row, or a value is of the wrong kind.
     """
     fields = {field.name: str(field.type) for field in dataclasses.fields(row_type)}  # type: ignore[arg-type]
+    added = [
+        field.name
+        for field in dataclasses.fields(row_type)  # type: ignore[arg-type]
+        if field.default is not dataclasses.MISSING
+    ]
     text = path.read_text(encoding="utf-8")
     whole_lines = text[: text.rfind("\n") + 1].splitlines()
     reader = csv.DictReader(whole_lines)
-    if list(reader.fieldnames or []) != list(fields):
-        raise ValueError(f"{path} must have the columns {list(fields)}, got {list(reader.fieldnames or [])}")
+    columns = list(reader.fieldnames or [])
+    if columns != [name for name in fields if name in columns or name not in added]:
+        required = [name for name in fields if name not in added]
+        raise ValueError(f"{path} must have the columns {required}, and may have {added}, got {columns}")
+    fields = {name: fields[name] for name in columns}
     try:
         return [_parse_row(line, fields, row_type) for line in reader]
     except (ValueError, TypeError) as error:

@@ -70,7 +70,20 @@ def _summarise_repeat(
         chunk_latency_ms=first.chunk_latency_ms,
         checkpoint=first.checkpoint,
         commit=first.commit,
+        plans_drawn=_sum_or_none([row.plans_drawn for row in episodes]),
+        n_plans=_sum_or_none([row.n_plans for row in episodes]),
+        flagged=_count_or_none([row.plan_flagged for row in episodes]),
+        flagged_collisions=_count_or_none([_is_flagged_collision(row) for row in episodes]),
     )
+
+
+def _is_flagged_collision(row: EpisodeRow) -> bool | None:
+    return None if row.collision is None or row.plan_flagged is None else row.collision and row.plan_flagged
+
+
+def _sum_or_none(values: Sequence[int | None]) -> int | None:
+    present = [value for value in values if value is not None]
+    return sum(present) if present else None
 
 
 def _count_or_none(values: Sequence[bool | None]) -> int | None:
@@ -80,6 +93,10 @@ def _count_or_none(values: Sequence[bool | None]) -> int | None:
 def _mean_or_none(values: Sequence[float | None]) -> float | None:
     present = [value for value in values if value is not None]
     return round(statistics.fmean(present), 6) if present else None
+
+
+def _rate_or_none(count: int, total: int) -> Rate | None:
+    return Rate(count, total) if total else None
 
 
 @dataclass(frozen=True)
@@ -113,6 +130,37 @@ class Cell:
         return self._rate_if_reported([row.plans_in_wall for row in self.repeats])
 
     @property
+    def flagged(self) -> Rate | None:
+        """The rate of episodes with a flagged plan, among those whose plans were measured; None if there are none."""
+        measured = [row for row in self.repeats if row.flagged is not None]
+        return _rate_or_none(
+            sum(row.flagged or 0 for row in measured), sum(row.n_episodes for row in measured)
+        )
+
+    @property
+    def unflagged_collision(self) -> Rate | None:
+        """The rate of collisions among the episodes without a flagged plan; None if there are none or it is unknown."""
+        return _rate_or_none(
+            sum(collisions - both for _, collisions, _, both in self._flagged_and_colliding),
+            sum(n_episodes - flagged for n_episodes, _, flagged, _ in self._flagged_and_colliding),
+        )
+
+    @property
+    def collision_flagged(self) -> Rate | None:
+        """The rate of colliding episodes that had a flagged plan (recall); None if there are none or it is unknown."""
+        return _rate_or_none(
+            sum(both for *_, both in self._flagged_and_colliding),
+            sum(collisions for _, collisions, _, _ in self._flagged_and_colliding),
+        )
+
+    @property
+    def plans_drawn_each(self) -> float | None:
+        """The mean number of plans drawn for each one that is executed; None if it was not measured."""
+        measured = [(row.plans_drawn, row.n_plans) for row in self.repeats if row.plans_drawn is not None]
+        n_plans = sum(n_plans or 0 for _, n_plans in measured)
+        return sum(drawn for drawn, _ in measured) / n_plans if n_plans else None
+
+    @property
     def success(self) -> Rate:
         """The rate of episodes that reach the goal."""
         return Rate(sum(row.successes for row in self.repeats), self.n_episodes)
@@ -144,6 +192,15 @@ class Cell:
     def _rate_if_reported(self, counts: Sequence[int | None]) -> Rate | None:
         reported = [count for count in counts if count is not None]
         return Rate(sum(reported), self.n_episodes) if reported else None
+
+    @property
+    def _flagged_and_colliding(self) -> list[tuple[int, int, int, int]]:
+        """Episodes, those that collide, that are flagged, and both, of each repeat in which they are known."""
+        return [
+            (row.n_episodes, row.collisions, row.flagged, row.flagged_collisions)
+            for row in self.repeats
+            if row.collisions is not None and row.flagged is not None and row.flagged_collisions is not None
+        ]
 
     @property
     def mcnemar_p(self) -> float | None:

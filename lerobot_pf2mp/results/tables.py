@@ -4,22 +4,41 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from lerobot_pf2mp.results.rate import Rate
 from lerobot_pf2mp.results.rows import NO_GUIDANCE
 from lerobot_pf2mp.results.summary import Cell
 
-_COLUMNS = (
-    "task",
-    "policy",
-    "guidance",
-    "lambda",
-    "collision rate [%]",
-    "95 % interval",
-    "p (McNemar)",
-    "success rate [%]",
-    "episodes",
+# The text of each column; empty where a cell has nothing to show.
+_COLUMNS: dict[str, Callable[[Cell], str]] = {
+    "task": lambda cell: cell.repeats[0].task,
+    "policy": lambda cell: cell.repeats[0].policy,
+    "guidance": lambda cell: cell.repeats[0].guidance_integrator,
+    "lambda": lambda cell: _scale(cell),
+    "variant": lambda cell: cell.repeats[0].variant,
+    "collision rate [%]": lambda cell: _rate(cell, cell.collision, "collisions"),
+    "95 % interval": lambda cell: _interval(cell.collision),
+    "p (McNemar)": lambda cell: _p_value(cell.mcnemar_p),
+    "plans in the wall [%]": lambda cell: _rate(cell, cell.plan_in_wall, "plans_in_wall"),
+    "success rate [%]": lambda cell: _rate(cell, cell.success, "successes"),
+    "stroke error [mm]": lambda cell: _number(cell.stroke_error),
+    "plans": lambda cell: _number(cell.plans_drawn_each),
+    "flagged [%]": lambda cell: _with_interval(cell.flagged),
+    "collisions among the unflagged [%]": lambda cell: _with_interval(cell.unflagged_collision),
+    "colliding episodes flagged [%]": lambda cell: _with_interval(cell.collision_flagged),
+    "episodes": lambda cell: _episodes(cell),
+}
+
+# Columns that are left out if no cell has something to show there.
+_OPTIONAL = (
+    "variant",
+    "plans in the wall [%]",
+    "stroke error [mm]",
+    "plans",
+    "flagged [%]",
+    "collisions among the unflagged [%]",
+    "colliding episodes flagged [%]",
 )
 
 
@@ -28,7 +47,8 @@ def make_markdown(cells: Sequence[Cell]) -> str:
 
     Rates are means, with the standard deviation over repeats and over training seeds if there are several. The 95 %
     interval is Wilson's over all episodes. p is the p-value of McNemar's exact test against the same weights without
-    guidance.
+    guidance. "plans" is the mean number of plans drawn for each one that is executed; an episode is flagged if one of the
+    executed plans still left the demonstrated region. The rates of flagged episodes have their interval in brackets.
     """
     columns, rows = _rows(cells)
     lines = [f"| {' | '.join(columns)} |", f"|{'---|' * len(columns)}"]
@@ -51,40 +71,19 @@ def make_latex(cells: Sequence[Cell]) -> str:
 
 
 def _rows(cells: Sequence[Cell]) -> tuple[list[str], list[list[str]]]:
-    has_variants = any(cell.repeats[0].variant for cell in cells)
-    has_plans = any(cell.plan_in_wall for cell in cells)
-    has_strokes = any(cell.stroke_error is not None for cell in cells)
-    columns = [*_COLUMNS[:4], *(["variant"] if has_variants else []), *_COLUMNS[4:]]
-    if has_plans:
-        columns.insert(-2, "plans in the wall [%]")
-    if has_strokes:
-        columns.insert(-1, "stroke error [mm]")
-    return columns, [_row(cell, has_variants, has_plans, has_strokes) for cell in cells]
+    rows = [{column: text(cell) for column, text in _COLUMNS.items()} for cell in cells]
+    columns = [column for column in _COLUMNS if column not in _OPTIONAL or any(row[column] for row in rows)]
+    return columns, [[row[column] for column in columns] for row in rows]
 
 
-def _row(cell: Cell, has_variants: bool, has_plans: bool, has_strokes: bool) -> list[str]:
+def _scale(cell: Cell) -> str:
     first = cell.repeats[0]
-    collision = cell.collision
-    p = cell.mcnemar_p
-    plan = cell.plan_in_wall
-    stroke_error = cell.stroke_error
-    return [
-        first.task,
-        first.policy,
-        first.guidance_integrator,
-        "" if first.guidance_integrator == NO_GUIDANCE else f"{first.guidance_scale:g}",
-        *([first.variant] if has_variants else []),
-        "" if collision is None else _rate(cell, collision, "collisions"),
-        "" if collision is None else "{:.2f} to {:.2f}".format(*(100 * end for end in collision.interval)),
-        "" if p is None else _p_value(p),
-        *([] if not has_plans else [""] if plan is None else [_rate(cell, plan, "plans_in_wall")]),
-        _rate(cell, cell.success, "successes"),
-        *([] if not has_strokes else [""] if stroke_error is None else [f"{stroke_error:.2f}"]),
-        _episodes(cell),
-    ]
+    return "" if first.guidance_integrator == NO_GUIDANCE else f"{first.guidance_scale:g}"
 
 
-def _rate(cell: Cell, rate: Rate, count: str) -> str:
+def _rate(cell: Cell, rate: Rate | None, count: str) -> str:
+    if rate is None:
+        return ""
     text = f"{100 * rate.value:.2f}"
     over_repeats, over_seeds = cell.deviation(count, "repeat"), cell.deviation(count, "seed")
     if over_repeats is not None:
@@ -92,6 +91,24 @@ def _rate(cell: Cell, rate: Rate, count: str) -> str:
     if over_seeds is not None:
         text += f" (seeds ± {100 * over_seeds:.2f})"
     return text
+
+
+def _interval(rate: Rate | None) -> str:
+    return "" if rate is None else "{:.2f} to {:.2f}".format(*(100 * end for end in rate.interval))
+
+
+def _with_interval(rate: Rate | None) -> str:
+    """A rate with its interval, such as 0.40 (0.12 to 1.2)."""
+    if rate is None:
+        return ""
+    value, low, high = (
+        f"{100 * share:.{1 if share >= 0.01 else 2}f}" for share in (rate.value, *rate.interval)
+    )
+    return f"{value} ({low} to {high})"
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.2f}"
 
 
 def _episodes(cell: Cell) -> str:
@@ -106,7 +123,9 @@ def _episodes(cell: Cell) -> str:
     return " x ".join(map(str, counts))
 
 
-def _p_value(p: float) -> str:
+def _p_value(p: float | None) -> str:
+    if p is None:
+        return ""
     return f"{p:.2g}" if p >= 1e-4 else "< 1e-4"
 
 
