@@ -63,7 +63,14 @@ def batches_for(policy: Any, n: int) -> list[dict[str, Any]]:
     if isinstance(policy, PF2MPPolicy):
         demonstrated = DemonstratedActions(policy.config.field_settings)
         actions = 0.2 * torch.randn(40, HORIZON, ACTION_DIM, generator=generator)
-        demonstrated.observe(actions, None, None, settings=policy.config.field_settings)
+        demonstrated.observe(
+            actions,
+            None,
+            HORIZON * torch.arange(40),
+            torch.arange(40),
+            settings=policy.config.field_settings,
+            n_executed=HORIZON,
+        )
         batches = [{**batch, POTENTIAL_FIELD: demonstrated} for batch in batches]
     return batches
 
@@ -116,9 +123,12 @@ def test_the_steps_of_a_guided_policy_are_one_graph(sums: str) -> None:
 def test_a_compiled_policy_watches_its_plans() -> None:
     policy = policy_of("pf2mp", on_unsupported="hold", guidance_scale=0.0)
     (batch,), (noise,) = batches_for(policy, 1), noises(1)
+    torch.manual_seed(2)
     chunk = torch.compile(policy.predict_action_chunk, backend="eager")(dict(batch), noise=3 * noise)
     support = policy.support
+    assert policy.plans.n_drawn.tolist() == [8]
     policy.reset()
+    torch.manual_seed(2)
     torch.testing.assert_close(chunk, policy.predict_action_chunk(batch, noise=3 * noise))
     assert (support < 0).any()
     torch.testing.assert_close(support, policy.support)

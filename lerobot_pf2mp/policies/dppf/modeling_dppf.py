@@ -71,8 +71,7 @@ class DPPFPolicy(WithoutPEFT, WithModelCard, DiffusionPolicy):
                 dimensions, or one without demonstrated plans; or if an action is not finite.
             UnsupportedPlanError: With ``on_unsupported=stop``, if no plan stays in the demonstrated region.
         """
-        self.guidance.begin(None)
-        guide = guide or self.guidance.guide(batch, next(self.parameters()).device)
+        guide = guide or self.guidance.begin(batch, next(self.parameters()).device)
         window = self._with_window(batch)
         with self._guided(guide):
             chunk = super().predict_action_chunk(window, noise=noise)

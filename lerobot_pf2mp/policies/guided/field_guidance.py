@@ -161,12 +161,25 @@ class FieldGuidance:
         self._executed = action
 
     @torch.compiler.disable
-    def begin(self, left_over: Tensor | None) -> None:
-        """A call begins; `left_over` holds the actions ``(B, T_left, A)`` of the last chunk that were not executed."""
+    def begin(
+        self, batch: dict[str, Any], device: torch.device, left_over: Tensor | None = None
+    ) -> Guide | None:
+        """A call begins: `guide`, and the time that the call takes counts from here.
+
+        Args:
+            batch: As for `guide`.
+            device: As there.
+            left_over: ``(B, T_left, A)`` actions of the last chunk that were not executed; None if no robot is moving on
+                them.
+
+        Raises:
+            ValueError: As there.
+        """
         n_executed = None
         if left_over is not None and self._last is not None:
             n_executed = max(self._last[0].shape[1] - left_over.shape[1], 0)
         self._budget.begin(n_executed)
+        return self.guide(batch, device)
 
     def choose(
         self,

@@ -77,8 +77,7 @@ class PF2MPPolicy(FMPPolicy):
         """
         left_over = options.get("prev_chunk_left_over")
         n_steps = None if left_over is None else options.get("inference_delay", 0)
-        self.guidance.begin(left_over)
-        guide = guide or self.guidance.guide(batch, next(self.parameters()).device)
+        guide = guide or self.guidance.begin(batch, next(self.parameters()).device, left_over)
         draw = self._drawing(batch, guide, **options)
         return self.guidance.choose(
             batch,
