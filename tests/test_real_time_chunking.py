@@ -6,16 +6,17 @@ from typing import Any
 import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature, RTCAttentionSchedule
+from lerobot.policies.rtc.action_queue import ActionQueue
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from lerobot.policies.rtc.modeling_rtc import RTCProcessor
-from lerobot.rollout.inference.rtc import supports_rtc_inference
+from lerobot.rollout.inference.rtc import _normalize_prev_actions_length, supports_rtc_inference
 from torch import Tensor
 
 from lerobot_pf2mp import DPPFConfig, PF2MPConfig
 from lerobot_pf2mp.flow_matching import integrate
 from lerobot_pf2mp.policies.batch_keys import POTENTIAL_FIELD
 from lerobot_pf2mp.policies.dppf.modeling_dppf import DPPFPolicy
-from lerobot_pf2mp.policies.fmp.real_time_chunking import continuing
+from lerobot_pf2mp.policies.fmp.real_time_chunking import continuing, is_committed, n_executed_of
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
 from lerobot_pf2mp.policies.pf2mp.modeling_pf2mp import PF2MPPolicy
 
@@ -43,7 +44,14 @@ def batch_for(policy: PF2MPPolicy) -> dict[str, Any]:
     generator = torch.Generator().manual_seed(1)
     demonstrated = DemonstratedActions(policy.config.field_settings)
     actions = 0.2 * torch.randn(40, HORIZON, ACTION_DIM, generator=generator)
-    demonstrated.observe(actions, None, None, settings=policy.config.field_settings)
+    demonstrated.observe(
+        actions,
+        None,
+        HORIZON * torch.arange(40),
+        torch.arange(40),
+        settings=policy.config.field_settings,
+        n_executed=HORIZON,
+    )
     return {STATE: torch.rand(1, 3, generator=generator), POTENTIAL_FIELD: demonstrated}
 
 
@@ -120,3 +128,95 @@ def test_single_actions_and_a_last_chunk_without_it_are_errors() -> None:
         pf2mp(FIRM).select_action({STATE: torch.zeros(1, 3)})
     with pytest.raises(ValueError, match="prev_chunk_left_over needs rtc_config, got none"):
         chunk_of(pf2mp(None), prev_chunk_left_over=torch.zeros(4, ACTION_DIM))
+
+
+# What is left of the last chunk.
+
+
+def steered(left_over: Tensor, delay: int = 2) -> Tensor:
+    """How much the processor changes each velocity, ``(B, HORIZON)``."""
+    generator = torch.Generator().manual_seed(3)
+    x_t, velocity = torch.randn(2, 2, HORIZON, ACTION_DIM, generator=generator)
+    steer = continuing(RTCProcessor(FIRM), left_over, delay)
+    return (steer(x_t, torch.full((2,), 0.4), velocity) - velocity).norm(dim=-1)
+
+
+def test_in_inference_mode_chunks_continue_too() -> None:
+    policy = pf2mp(FIRM)
+    left_over = torch.full((5, ACTION_DIM), 0.3)
+    wanted = chunk_of(policy, prev_chunk_left_over=left_over, inference_delay=2)
+    with torch.inference_mode():
+        found = chunk_of(policy, prev_chunk_left_over=left_over.clone(), inference_delay=2)
+    assert torch.equal(found, wanted)
+    assert not torch.allclose(found, chunk_of(policy))
+
+
+@pytest.mark.parametrize("n_zeros", [0, 1, 5])
+def test_zeros_that_lerobot_appends_are_no_actions(n_zeros: int) -> None:
+    left_over = torch.randn(4, ACTION_DIM, generator=torch.Generator().manual_seed(4))
+    padded = torch.cat([left_over, torch.zeros(n_zeros, ACTION_DIM)])
+    assert torch.equal(steered(padded, delay=8), steered(left_over, delay=8))
+    assert (steered(padded, delay=8)[:, :4] > 0.1).all()
+    assert steered(padded, delay=8)[:, 4:].abs().max() < 1e-4
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+def test_from_an_action_that_is_not_finite_on_nothing_is_continued(value: float) -> None:
+    left_over = torch.randn(2, 6, ACTION_DIM, generator=torch.Generator().manual_seed(4))
+    broken = left_over.clone()
+    broken[1, 2, 0] = value  # of the second robot only
+    found = steered(broken)
+    torch.testing.assert_close(found[0], steered(left_over)[0])
+    torch.testing.assert_close(found[1, :2], steered(left_over)[1, :2])
+    assert found.isfinite().all() and found[1, 2:].abs().max() < 1e-4
+
+
+@pytest.mark.parametrize("left_over", [torch.zeros(10, ACTION_DIM), torch.full((3, ACTION_DIM), torch.nan)])
+def test_a_left_over_of_nothing_is_none(left_over: Tensor) -> None:
+    policy = pf2mp(FIRM)
+    found = chunk_of(policy, prev_chunk_left_over=left_over, inference_delay=3)
+    torch.testing.assert_close(found, chunk_of(policy), rtol=1e-5, atol=1e-5)
+
+
+def test_an_action_at_zero_among_others_is_an_action() -> None:
+    left_over = torch.tensor([[0.0, 0.0], [0.1, 0.0], [0.0, 0.0], [0.0, 0.2], [0.0, 0.0]])
+    assert is_committed(left_over).tolist() == [True, True, True, True, False]
+
+
+@pytest.mark.parametrize("n_executed", [0, 1, 7, 15])
+@pytest.mark.parametrize("n_kept", [3, 10, HORIZON])
+def test_how_many_actions_were_executed_is_told_by_what_is_left(n_executed: int, n_kept: int) -> None:
+    chunk = torch.randn(1, HORIZON, ACTION_DIM, generator=torch.Generator().manual_seed(5))
+    left_over = _normalize_prev_actions_length(chunk[0, n_executed:], n_kept)  # as LeRobot cuts and pads it
+    assert n_executed_of(chunk, left_over) == n_executed
+    assert n_executed_of(chunk + 1, left_over) is None
+
+
+def test_all_actions_were_executed_if_nothing_is_left() -> None:
+    assert n_executed_of(torch.ones(1, HORIZON, ACTION_DIM), torch.zeros(10, ACTION_DIM)) == HORIZON
+
+
+@pytest.mark.parametrize("n_taken", [5, HORIZON])
+def test_with_lerobots_queue_the_next_plan_begins_where_the_robot_is(n_taken: int) -> None:
+    """A plan that takes longer than its chunk leaves nothing, and LeRobot's engine then hands over zeros."""
+    policy = pf2mp(FIRM, max_plans=1, guidance_scale=0.0)
+    policy.guidance.measures_plans = True
+    queue = ActionQueue(RTCConfig(enabled=True, execution_horizon=6))
+    batch, places = batch_for(policy), []
+    original = policy.guidance._places_of_robots
+    policy.guidance._places_of_robots = lambda *args: places.append(original(*args)) or places[-1]  # type: ignore[method-assign]
+    chunk = policy.predict_action_chunk(batch)
+    queue.merge(chunk[0], chunk[0], 0)
+    taken = [queue.get() for _ in range(n_taken)]
+    left_over = _normalize_prev_actions_length(queue.get_left_over(), 6)
+    policy.predict_action_chunk(batch, prev_chunk_left_over=left_over, inference_delay=2)
+    assert torch.equal(places[1], taken[-1].unsqueeze(0))
+    # Not to the middle of the range, where the zeros are.
+    plain = policy.predict_action_chunk(batch, noise=torch.ones(1, HORIZON, ACTION_DIM))
+    again = policy.predict_action_chunk(
+        batch, noise=torch.ones(1, HORIZON, ACTION_DIM), prev_chunk_left_over=left_over, inference_delay=2
+    )
+    if n_taken == HORIZON:
+        torch.testing.assert_close(again, plain, rtol=1e-5, atol=1e-5)
+    else:
+        assert (again[0, :2] - left_over[:2]).norm() < 0.5 * (plain[0, :2] - left_over[:2]).norm()

@@ -20,6 +20,7 @@ from torch import Tensor
 from lerobot_pf2mp.flow_matching import Guide
 from lerobot_pf2mp.guidance import GuidanceSettings, make_guide
 from lerobot_pf2mp.policies.batch_keys import ACTION_IS_PAD, POTENTIAL_FIELD
+from lerobot_pf2mp.policies.fmp.real_time_chunking import is_committed, n_executed_of
 from lerobot_pf2mp.policies.guided.action_kind import warn_unless_positions
 from lerobot_pf2mp.policies.guided.action_units import normalised_unit, normaliser_of, places_of_states
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
@@ -77,6 +78,10 @@ class FieldGuidance:
         self._executed: Tensor | None = None  # (B, A) the last action that `select_action` gave away
         self._last: tuple[Tensor, Tensor] | None = None  # the last chunk (B, T, A) and where it began (B, A)
         self._budget = LatencyBudget()
+        # Of the call that began: actions of the last chunk that were executed, and those that will be until the end of the
+        # call; None if that is unknown, or the robot waits.
+        self._n_executed: int | None = None
+        self._n_steps: int | None = None
 
     @property
     def support(self) -> Tensor | None:
@@ -162,23 +167,31 @@ class FieldGuidance:
 
     @torch.compiler.disable
     def begin(
-        self, batch: dict[str, Any], device: torch.device, left_over: Tensor | None = None
+        self,
+        batch: dict[str, Any],
+        device: torch.device,
+        left_over: Tensor | None = None,
+        inference_delay: int = 0,
     ) -> Guide | None:
         """A call begins: `guide`, and the time that the call takes counts from here.
 
         Args:
             batch: As for `guide`.
             device: As there.
-            left_over: ``(B, T_left, A)`` actions of the last chunk that were not executed; None if no robot is moving on
+            left_over: ``([B,] T_left, A)`` actions of the last chunk that were not executed; None if no robot is moving on
                 them.
+            inference_delay: Number of those that are executed until the chunk is needed.
 
         Raises:
             ValueError: As there.
         """
-        n_executed = None
-        if left_over is not None and self._last is not None:
-            n_executed = max(self._last[0].shape[1] - left_over.shape[1], 0)
-        self._budget.begin(n_executed)
+        self._n_executed = self._n_steps = None
+        if left_over is not None:
+            if self._last is not None:
+                self._n_executed = n_executed_of(self._last[0], left_over)
+            if bool(is_committed(left_over).any()):  # otherwise the robot waits
+                self._n_steps = inference_delay
+        self._budget.begin(self._n_executed)
         return self.guide(batch, device)
 
     def choose(
@@ -186,8 +199,6 @@ class FieldGuidance:
         batch: dict[str, Any],
         chunk: Tensor,
         draw_more: DrawMore,
-        left_over: Tensor | None = None,
-        n_steps: int | None = None,
     ) -> Tensor:
         """The chunks ``(B, T, A)`` to execute: checked, drawn again if need be, see ``max_plans`` in `GuidedConfig`.
 
@@ -195,9 +206,6 @@ class FieldGuidance:
             batch: A batch that the policy's own preprocessor has made.
             chunk: ``(B, T, A)`` planned actions [normalised].
             draw_more: Draws further plans.
-            left_over: ``(B, T_left, A)`` actions of the last chunk that were not executed when the call began; None if no
-                robot is moving on them.
-            n_steps: Number of those that are executed until the chunk is needed; None if the robot waits for it.
 
         Raises:
             ValueError: If an action is not finite; if the field, or its calibration for plans, is missing although plans
@@ -208,7 +216,7 @@ class FieldGuidance:
         is_checked = config.checks_plans or self.measures_plans
         if torch.compiler.is_compiling() and POTENTIAL_FIELD not in batch:
             return require_finite(chunk, batch)  # one graph, for a guide that the caller made
-        return self._choose(batch, chunk, draw_more, left_over, n_steps, is_checked)
+        return self._choose(batch, chunk, draw_more, is_checked)
 
     @torch.compiler.disable  # whether other plans are drawn depends on the values
     def _choose(
@@ -216,8 +224,6 @@ class FieldGuidance:
         batch: dict[str, Any],
         chunk: Tensor,
         draw_more: DrawMore,
-        left_over: Tensor | None,
-        n_steps: int | None,
         is_checked: bool,
     ) -> Tensor:
         require_finite(chunk, batch)
@@ -225,7 +231,7 @@ class FieldGuidance:
         check = self._plan_check(batch, chunk) if is_checked else None
         if check is not None:
             config = self.config
-            places = self._places_of_robots(batch, chunk, left_over)
+            places = self._places_of_robots(batch, chunk)
 
             def draw(rows: Tensor, n: int) -> Tensor:
                 began = time.perf_counter()
@@ -233,13 +239,13 @@ class FieldGuidance:
                 self._budget.took(time.perf_counter() - began)
                 return more
 
-            has_time = self._budget.allows_another_pass(n_steps)
+            has_time = self._budget.allows_another_pass(self._n_steps)
             chunk, self.plans = choose_plans(
                 check, places, chunk, config.max_plans, draw if has_time else None
             )
             chunk = react(config.on_unsupported, self.plans, chunk, places)
             self._last = chunk, places
-        self._executed = None
+        self._executed = self._n_executed = self._n_steps = None
         return chunk
 
     def _plan_check(self, batch: dict[str, Any], chunk: Tensor) -> PlanCheck | None:
@@ -260,7 +266,7 @@ class FieldGuidance:
             return None
         return PlanCheck(field, threshold.log_density, config.field_settings.action_dims)
 
-    def _places_of_robots(self, batch: dict[str, Any], chunk: Tensor, left_over: Tensor | None) -> Tensor:
+    def _places_of_robots(self, batch: dict[str, Any], chunk: Tensor) -> Tensor:
         """Where the robots are when they begin to execute a chunk, as actions ``(B, A)`` [normalised].
 
         It is the last action that was executed. Where that is unknown, as in the first chunk, it is the observed state, and
@@ -275,11 +281,9 @@ class FieldGuidance:
                     f"{n_robots}"
                 )
             return self._executed.to(chunk)
-        if left_over is not None and self._last is not None and len(self._last[0]) == n_robots:
+        if self._last is not None and self._n_executed is not None and len(self._last[0]) == n_robots:
             before, place = self._last
-            n_executed = before.shape[1] - left_over.shape[1]
-            if n_executed >= 0:
-                return (before[:, n_executed - 1] if n_executed else place).to(chunk)
+            return (before[:, self._n_executed - 1] if self._n_executed else place).to(chunk)
         demonstrations, states = batch.get(POTENTIAL_FIELD), batch.get(OBS_STATE)
         first = chunk[:, 0]
         if not isinstance(demonstrations, DemonstratedActions) or states is None:

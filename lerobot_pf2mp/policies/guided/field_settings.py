@@ -40,7 +40,7 @@ class FieldSettings:
         ValueError: If a value breaks its rule. The message names the option of the policy's configuration.
     """
 
-    n_points: int = 3000
+    n_points: int = 20000
     action_dims: tuple[int, ...] | None = None
     bandwidth: float | str = DEFAULT_BANDWIDTH
     threshold_quantile: float = THRESHOLD_QUANTILE
@@ -48,8 +48,8 @@ class FieldSettings:
     leave_out: str = LEFT_OUT[0]
     angle_dims: tuple[int, ...] | None = None
     angle_period: float = 2 * math.pi
-    region: str = "fading"
-    quantile: float = 0.8
+    region: str = "unsupported"
+    quantile: float = 0.95
 
     def __post_init__(self) -> None:
         if self.n_points < 1:

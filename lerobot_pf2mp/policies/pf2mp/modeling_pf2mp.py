@@ -75,16 +75,17 @@ class PF2MPPolicy(FMPPolicy):
                 dimensions, or one without demonstrated plans; or if an action is not finite.
             UnsupportedPlanError: With ``on_unsupported=stop``, if no plan stays in the demonstrated region.
         """
-        left_over = options.get("prev_chunk_left_over")
-        n_steps = None if left_over is None else options.get("inference_delay", 0)
-        guide = guide or self.guidance.begin(batch, next(self.parameters()).device, left_over)
+        guide = guide or self.guidance.begin(
+            batch,
+            next(self.parameters()).device,
+            options.get("prev_chunk_left_over"),
+            options.get("inference_delay", 0),
+        )
         draw = self._drawing(batch, guide, **options)
         return self.guidance.choose(
             batch,
             draw(noise, generator),
             lambda rows, n: draw(generator=generator, rows=rows, n_each=n),
-            left_over,
-            n_steps,
         )
 
     def select_action(self, batch: dict[str, Any], *args: Any, **kwargs: Any) -> Tensor:
