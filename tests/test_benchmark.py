@@ -32,14 +32,18 @@ from lerobot_pf2mp.benchmark.run import run_benchmark
 from lerobot_pf2mp.benchmark.spec import NONE, BenchmarkSpec, Guidance
 from lerobot_pf2mp.envs.maze.maze_env import MazeEnv
 from lerobot_pf2mp.errors import ConfigError
+from lerobot_pf2mp.loading import loaded_demonstrations
 from lerobot_pf2mp.policies.fmp import modeling_fmp
+from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
 from lerobot_pf2mp.policies.guided.field_guidance import FieldGuidance
+from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
 from lerobot_pf2mp.policies.pf2mp.modeling_pf2mp import PF2MPPolicy
+from lerobot_pf2mp.policies.plans.plans import Plans
 from lerobot_pf2mp.results.rows import SummaryRow, read_rows
 
 COLUMNS = (
     "task,policy,guidance_integrator,guidance_scale,variant,seed,repeat,episode,success,collision,plan_in_wall,min_clearance_m,"
-    "path_length_m,stroke_error_mm,steps,chunk_latency_ms,checkpoint,commit"
+    "path_length_m,stroke_error_mm,steps,chunk_latency_ms,checkpoint,commit,plans_drawn,n_plans,plan_flagged"
 )
 
 
@@ -473,6 +477,139 @@ def test_the_latency_is_that_of_planning_a_chunk_for_one_robot(
     assert all(1000 * at_least <= row.chunk_latency_ms < 2000 for row in rows_of(tmp_path))
 
 
+# Plans
+
+N_CHUNKS = 2  # of four actions, in six steps
+
+
+@pytest.fixture
+def checked(monkeypatch: pytest.MonkeyPatch) -> list[Plans | None]:
+    """The plans of every chunk that is not for the measurement of the latency."""
+    seen: list[Plans | None] = []
+    choose = FieldGuidance.choose
+
+    def recorded(self: Any, batch: dict, chunk: Tensor, *arguments: Any) -> Tensor:
+        chosen = choose(self, batch, chunk, *arguments)
+        if len(chunk) > 1:
+            seen.append(self.plans)
+        return chosen
+
+    monkeypatch.setattr(FieldGuidance, "choose", recorded)
+    return seen
+
+
+@pytest.mark.parametrize("kind", ["pf2mp", "dppf"])
+def test_rows_count_the_plans_that_the_policy_drew_and_flagged(
+    checkpoints: dict[str, str], tmp_path: Path, checked: list[Plans], kind: str
+) -> None:
+    # A rate at which the untrained policy is flagged now and then.
+    variants = {"": {"max_plans": 2, "false_alarm_rate": 0.9}}
+    rows = run(spec_of({kind: checkpoints[kind]}, "proximal:0.8", n_repeats=2, variants=variants), tmp_path)
+    assert len(checked) == 2 * 2 * N_CHUNKS  # repeats, rollouts of two robots
+    drawn = torch.stack([plans.n_drawn for plans in checked]).view(2, 2, N_CHUNKS, 2).sum(dim=2).flatten(1)
+    flagged = (
+        torch.stack([plans.is_flagged for plans in checked]).view(2, 2, N_CHUNKS, 2).any(dim=2).flatten(1)
+    )
+    assert len(drawn.unique()) > 1, "one number for all would hide a sum over other chunks or robots"
+    assert [(row.plans_drawn, row.n_plans, row.plan_flagged) for row in rows] == [
+        (drawn[repeat, episode].item(), N_CHUNKS, flagged[repeat, episode].item())
+        for repeat in (0, 1)
+        for episode in range(N_EPISODES)  # the fourth is one too many
+    ]
+    (summary, _) = read_rows(tmp_path / "summary.csv", SummaryRow)
+    assert (summary.plans_drawn, summary.n_plans) == (drawn[0, :N_EPISODES].sum(), N_EPISODES * N_CHUNKS)
+    assert summary.flagged == flagged[0, :N_EPISODES].sum()
+    assert " | plans | flagged [%] | " in (tmp_path / "table.md").read_text()
+
+
+def test_without_guidance_a_plan_is_checked_and_no_other_one_drawn_unless_the_variant_says_so(
+    checkpoints: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    used: list[tuple[int, bool]] = []
+    choose = FieldGuidance.choose
+
+    def recorded(self: Any, *arguments: Any) -> Tensor:
+        if (now := (self.config.max_plans, self.measures_plans)) not in used[-1:]:
+            used.append(now)
+        return choose(self, *arguments)
+
+    monkeypatch.setattr(FieldGuidance, "choose", recorded)
+    variants = {"": {}, "three": {"max_plans": 3}, "one": {"max_plans": 1}}
+    guidances = ("none", "proximal:0.8", "euler:0.01")
+    rows = run(spec_of({"pf2mp": checkpoints["pf2mp"]}, *guidances, variants=variants), tmp_path)
+    # First the latency, without a check that only the benchmark asks for.
+    own = [(1, False), (1, True), *[(8, False), (8, True)] * 2]
+    assert used == own + [(3, False), (3, True)] * 3 + [(1, False), (1, True)] * 3
+    for row in rows:
+        most = {"": 8 if row.guidance_scale else 1, "three": 3, "one": 1}[row.variant]
+        assert row.n_plans == N_CHUNKS and row.plan_flagged is not None
+        assert N_CHUNKS <= row.plans_drawn <= N_CHUNKS * most
+    assert {row.plans_drawn for row in rows if row.variant == "" and not row.guidance_scale} == {N_CHUNKS}
+    assert max(row.plans_drawn for row in rows if row.variant == "") > 3 * N_CHUNKS
+
+
+def test_measuring_plans_changes_no_episode(
+    checkpoints: dict[str, str], whole: Path, whole_spec: BenchmarkSpec, tmp_path: Path
+) -> None:
+    flow = run(spec_of({"flow": checkpoints["fmp"]}, n_repeats=2), tmp_path)
+    assert outcomes(flow, "flow") == outcomes(rows_of(whole), "fmp")
+    assert {(row.plans_drawn, row.n_plans, row.plan_flagged) for row in flow} == {(None, None, None)}
+    assert "flagged" not in (tmp_path / "table.md").read_text()
+
+
+def forgetful(checkpoint: str, folder: Path) -> str:
+    """The same checkpoint with a field from before plans were calibrated."""
+    policy, preprocessor, postprocessor = load_policy(checkpoint, device="cpu")
+    loaded_demonstrations(preprocessor).plans.forget()
+    for part in (policy, preprocessor, postprocessor):
+        part.save_pretrained(folder)
+    return str(folder)
+
+
+@pytest.mark.parametrize("guidance", ["none", "proximal:0.8"])
+def test_a_field_that_is_not_calibrated_for_plans_is_an_error_that_says_what_to_do(
+    checkpoints: dict[str, str],
+    tmp_path: Path,
+    evaluations: list[float],
+    caplog: pytest.LogCaptureFixture,
+    guidance: str,
+) -> None:
+    policies = {"pf2mp": forgetful(checkpoints["pf2mp"], tmp_path / "before")}
+    message = (
+        "the check of plans needs demonstrated plans, got a potential field without them: pf2mp-fit-field"
+    )
+    with pytest.raises(ValueError, match=f"^{message} makes .*, and max_plans=1 with .* needs none$"):
+        run_benchmark(spec_of(policies, guidance), tmp_path / "benchmark")
+    assert evaluations == [] and not caplog.records
+    rows = run(spec_of(policies, guidance, variants={"": {"max_plans": 1}}), tmp_path / "benchmark_of_one")
+    assert {(row.plans_drawn, row.n_plans, row.plan_flagged) for row in rows} == {(None, None, None)}
+
+
+def test_an_unguided_policy_without_a_field_is_evaluated_without_measuring_its_plans(
+    checkpoints: dict[str, str], tmp_path: Path
+) -> None:
+    policy, preprocessor, postprocessor = load_policy(checkpoints["pf2mp"], device="cpu", guidance_scale=0)
+    for step in preprocessor.steps:
+        if isinstance(step, PotentialFieldProcessorStep):
+            step.demonstrations = DemonstratedActions(step.demonstrations.settings)
+    for part in (policy, preprocessor, postprocessor):
+        part.save_pretrained(tmp_path / "unfitted")
+    rows = run(spec_of({"pf2mp": str(tmp_path / "unfitted")}), tmp_path / "benchmark")
+    assert [row.n_plans for row in rows] == [None] * N_EPISODES
+
+
+def test_results_from_before_plans_were_counted_are_added_to(
+    copied: Path, whole_spec: BenchmarkSpec, evaluations: list[float]
+) -> None:
+    lines = [line.split(",") for line in (copied / "episodes.csv").read_text().splitlines()]
+    old = "".join(",".join(line[:-3]) + "\n" for line in lines[: 1 + 2 * N_EPISODES])
+    (copied / "episodes.csv").write_text(old)
+    rows = run(whole_spec, copied)
+    assert len(evaluations) == 4
+    assert [row.n_plans for row in rows] == [None] * (2 * N_EPISODES) + [N_CHUNKS] * (4 * N_EPISODES)
+    assert (copied / "episodes.csv").read_text().splitlines()[0] == COLUMNS
+
+
 # The same for all
 
 
@@ -492,8 +629,10 @@ def test_all_policies_get_the_same_pairs_and_in_every_repeat_the_same_noise_and_
         return chunk
 
     def integrating(velocity: Any, x_0: Tensor, *arguments: Any, **options: Any) -> Tensor:
-        if len(x_0) > 1:  # not the measurement of the latency
-            chunks.append((observed[-1], x_0.clone()))
+        if observed:  # the first plan, which others may follow
+            positions = observed.pop()
+            if len(x_0) > 1:  # not the measurement of the latency
+                chunks.append((positions, x_0.clone()))
         return integrate(velocity, x_0, *arguments, **options)
 
     monkeypatch.setattr(PF2MPPolicy, "predict_action_chunk", observing)

@@ -6,10 +6,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, freeze_after_episode_end
 
 from lerobot_pf2mp import PF2MPMazeEnv
 from lerobot_pf2mp.benchmark.episode_recorder import Episode, EpisodeRecorder
+from lerobot_pf2mp.policies.plans.plans import Plans
 
 NEW_ROLLOUT = {NEW_ROLLOUT_OPTION: True}
 
@@ -233,3 +235,102 @@ def test_the_stroke_error_is_that_at_the_end_neither_the_least_nor_the_largest()
     drawn, walked = recorder.take_episodes(2)
     assert drawn.stroke_error == 1.5
     assert walked.stroke_error is None
+
+
+# Plans
+
+
+class Planner:
+    """A policy that has made its plans already: one entry for each step, None for going on with the last one."""
+
+    def __init__(self, *chunks: tuple[list[int], list[bool]] | None) -> None:
+        self._chunks = chunks
+        self.plans: Plans | None = None
+
+    def step(self, recorder: EpisodeRecorder, number: int) -> dict[str, Any]:
+        chunk = self._chunks[number]
+        if chunk is not None:
+            n_drawn, is_flagged = chunk
+            support = torch.where(torch.tensor(is_flagged), -1.0, 1.0)
+            self.plans = Plans(
+                torch.tensor(n_drawn), torch.tensor(is_flagged), support, support.unsqueeze(1).expand(-1, 2)
+            )
+        *_, info = recorder.step(np.zeros((recorder.num_envs, 1), dtype=np.float32))
+        return info
+
+    def roll_out(self, recorder: EpisodeRecorder) -> list[dict[str, Any]]:
+        recorder.reset(options=NEW_ROLLOUT)
+        return [self.step(recorder, number) for number in range(len(self._chunks))]
+
+
+def plans_of(episode: Episode) -> tuple[int | None, int | None, bool | None]:
+    return episode.plans_drawn, episode.n_plans, episode.plan_flagged
+
+
+@pytest.mark.parametrize("frozen", [True, False])
+def test_plans_are_summed_over_the_chunks_of_an_episode_up_to_its_end(frozen: bool) -> None:
+    recorder = recorder_of(
+        Walk([0.5] * 6),  # flagged in the second chunk alone
+        Walk([0.5] * 4),  # ends in the first step of the second chunk, which counts
+        Walk([0.5] * 3),  # ends with the first chunk
+        frozen=frozen,
+    )
+    planner = Planner(
+        ([1, 2, 3], [False, False, False]),
+        None,
+        ([8, 1, 8], [True, False, True]),
+        None,
+        ([4, 8, 8], [False, True, True]),
+    )
+    recorder.watch(planner)
+    planner.roll_out(recorder)
+    episodes = recorder.take_episodes(3)
+    assert [episode.steps for episode in episodes] == [5, 3, 2]
+    assert [plans_of(episode) for episode in episodes] == [(13, 3, True), (3, 2, False), (3, 1, False)]
+
+
+def test_the_info_of_every_step_says_what_was_planned_so_far() -> None:
+    recorder = recorder_of(Walk([0.5] * 5), Walk([0.5] * 2))
+    planner = Planner(None, ([1, 3], [False, True]), None, ([8, 8], [True, False]))
+    recorder.watch(planner)
+    first, *infos = planner.roll_out(recorder)
+    keys = {"plans_drawn", "n_plans", "is_plan_flagged"}
+    assert not keys & first.keys()  # nothing was planned yet
+    found = [{key: info[key].tolist() for key in keys} for info in infos]
+    began = {"plans_drawn": [1, 0], "n_plans": [1, 0], "is_plan_flagged": [False, False]}  # one has ended
+    assert found == [
+        began,
+        began,
+        {"plans_drawn": [9, 0], "n_plans": [2, 0], "is_plan_flagged": [True, False]},
+    ]
+    for info in infos:
+        assert all(info[f"_{key}"].tolist() == [True, True] for key in keys)
+    assert [info["clearance"].tolist() for info in infos] == [[0.5, 0.5]] * 3  # beside what there was
+
+
+def test_the_plans_of_one_rollout_do_not_count_in_the_next() -> None:
+    recorder = recorder_of(Walk([0.5] * 3))
+    planner = Planner(([8], [True]), None)
+    recorder.watch(planner)
+    planner.roll_out(recorder)
+    recorder.reset(options=NEW_ROLLOUT)  # the policy still has its last plans
+    recorder.step(np.zeros((1, 1), dtype=np.float32))
+    planner.roll_out(recorder)
+    assert [plans_of(episode) for episode in recorder.take_episodes(3)] == [
+        (8, 1, True),
+        (None, None, None),
+        (8, 1, True),
+    ]
+
+
+@pytest.mark.parametrize("policy", [object(), Planner(None, None), type("Other", (), {"plans": "many"})()])
+def test_a_policy_that_says_nothing_of_its_plans_changes_nothing(policy: Any) -> None:
+    recorder = recorder_of(Walk([0.5, 0.4, 0.3]))
+    recorder.watch(policy)
+    recorder.reset(options=NEW_ROLLOUT)
+    *_, info = recorder.step(np.zeros((1, 1), dtype=np.float32))
+    assert not any("plan" in key for key in info)
+    recorder.step(np.zeros((1, 1), dtype=np.float32))
+    assert recorder.take_episodes(1) == [
+        Episode(collision=False, min_clearance=0.3, path_length=1.0, steps=2)
+    ]

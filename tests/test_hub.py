@@ -27,7 +27,7 @@ from safetensors.torch import load_file, save_file
 
 from lerobot_pf2mp import PF2MPMazeEnv, load_policy
 from lerobot_pf2mp.commands import cli
-from lerobot_pf2mp.hub.model_card import env_options
+from lerobot_pf2mp.hub.model_card import CardFacts, PolicyFacts, env_options, make_model_card
 
 BIN = Path(sys.executable).parent
 SECONDS = 600  # for a command, on a machine that is busy with other things
@@ -517,6 +517,16 @@ def test_the_card_tells_lerobot_eval_the_environment():
         ]
     )
     assert env_options(None) == env_options({"type": "of somebody else"}) == []
+
+
+def test_the_card_explains_columns_of_plans_where_its_table_has_them() -> None:
+    policy = PolicyFacts("pf2mp", {}, {}, horizon=8, n_action_steps=4, num_inference_steps=2)
+    cards = [
+        str(make_model_card(CardFacts(policy, "user/repo", table=f"| policy |{columns}\n|---|")))
+        for columns in ("", " plans | flagged [%] |")
+    ]
+    said = ["An episode is flagged if one of the executed plans" in card for card in cards]
+    assert said == [False, True]
 
 
 # pf2mp-push.

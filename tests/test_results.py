@@ -94,9 +94,43 @@ def test_a_last_line_that_was_cut_off_is_left_out(tmp_path: Path, n_characters: 
 def test_other_columns_are_an_error_that_names_those_there_should_be(tmp_path: Path, header: str) -> None:
     (tmp_path / "rows.csv").write_text(header)
     with pytest.raises(
-        ValueError, match=r"rows.csv must have the columns \['task', 'policy', .*'commit'\], got \["
+        ValueError,
+        match=r"rows.csv must have the columns \['task', .*'commit'\], and may have \['plans_drawn', .*'\], got \[",
     ):
         read_rows(tmp_path / "rows.csv", EpisodeRow)
+
+
+PLAN_COLUMNS = {
+    EpisodeRow: ["plans_drawn", "n_plans", "plan_flagged"],
+    SummaryRow: ["plans_drawn", "n_plans", "flagged", "flagged_collisions"],
+}
+
+
+@pytest.mark.parametrize("row", [EPISODE, SUMMARY], ids=["episodes", "summary"])
+def test_a_file_from_before_plans_were_counted_is_read_without_them(
+    tmp_path: Path, row: EpisodeRow | SummaryRow
+) -> None:
+    kind, path = type(row), tmp_path / "rows.csv"
+    write_rows(path, [replace(row, plans_drawn=12, n_plans=3), row], kind)
+    lines = [line.split(",") for line in path.read_text().splitlines()]
+    n_added = len(PLAN_COLUMNS[kind])
+    assert lines[0][-n_added:] == PLAN_COLUMNS[kind]
+    for n_missing in range(n_added + 1):
+        old = [line[: len(line) - n_missing] for line in lines]
+        path.write_text("".join(",".join(line) + "\n" for line in old))
+        drawn, n_plans = (
+            (12, 3) if n_missing < n_added - 1 else (12, None) if n_missing < n_added else (None, None)
+        )
+        assert read_rows(path, kind) == [replace(row, plans_drawn=drawn, n_plans=n_plans), row]
+    path.write_text(",".join(lines[0][:-n_added]) + "\n" + ",".join(lines[1]) + "\n")
+    with pytest.raises(ValueError, match=f"a line must have {len(lines[0]) - n_added} values"):
+        read_rows(path, kind)
+
+
+def test_published_rows_of_before_are_read_without_plans() -> None:
+    rows = read_rows(Path(__file__).parents[1] / "results/maze/summary.csv", SummaryRow)
+    assert rows and all(getattr(row, name) is None for row in rows for name in PLAN_COLUMNS[SummaryRow])
+    assert "flagged" not in make_markdown(group_cells(rows))
 
 
 @pytest.mark.parametrize(
@@ -192,6 +226,23 @@ def test_repeats_are_told_apart_by_all_that_they_are(other: dict[str, Any]) -> N
     assert all(getattr(summary[1], name) == value for name, value in other.items())
 
 
+def test_plans_flagged_episodes_and_collisions_among_them_are_counted() -> None:
+    flagged = (True, False, True, False, True)
+    rows = [
+        replace(row, plans_drawn=10 + i, n_plans=i + 1, plan_flagged=is_flagged)
+        for i, (row, is_flagged) in enumerate(
+            zip(episodes([True, True, False, False, True]), flagged, strict=True)
+        )
+    ]
+    (summary,) = summarise(rows)
+    assert (summary.plans_drawn, summary.n_plans) == (60, 15)
+    assert (summary.collisions, summary.flagged, summary.flagged_collisions) == (3, 3, 2)
+    (silent,) = summarise([replace(row, collision=None) for row in rows])
+    assert (silent.flagged, silent.flagged_collisions) == (3, None)
+    (unmeasured,) = summarise(episodes([True, False]))
+    assert [getattr(unmeasured, name) for name in PLAN_COLUMNS[SummaryRow]] == [None] * 4
+
+
 # Twins
 
 
@@ -283,6 +334,49 @@ def test_rates_are_over_all_episodes() -> None:
     assert cell({"collisions": None}).collision is None
 
 
+MEASURED = {"plans_drawn": 150, "n_plans": 100, "collisions": 8, "flagged": 10, "flagged_collisions": 6}
+
+
+def test_flagged_episodes_are_set_against_collisions_over_all_repeats_in_which_they_are_known() -> None:
+    more = {
+        "repeat": 1,
+        "plans_drawn": 60,
+        "n_plans": 100,
+        "collisions": 2,
+        "flagged": 0,
+        "flagged_collisions": 0,
+    }
+    unmeasured = {"repeat": 2, "collisions": 30}
+    for repeats in ([MEASURED, more], [unmeasured, MEASURED, more]):
+        both = cell(*repeats)
+        assert both.flagged == Rate(10, 100)
+        assert both.unflagged_collision == Rate(2 + 2, 40 + 50)
+        assert both.collision_flagged == Rate(6, 10)
+        assert both.plans_drawn_each == pytest.approx(1.05)
+
+
+def test_a_rate_of_nothing_is_none() -> None:
+    nothing = cell({})
+    rates = (
+        nothing.flagged,
+        nothing.unflagged_collision,
+        nothing.collision_flagged,
+        nothing.plans_drawn_each,
+    )
+    assert rates == (None, None, None, None)
+    all_flagged = cell({**MEASURED, "flagged": 50, "flagged_collisions": 8})
+    assert (all_flagged.flagged, all_flagged.unflagged_collision) == (Rate(50, 50), None)
+    assert all_flagged.collision_flagged == Rate(8, 8)
+    safe = cell({**MEASURED, "collisions": 0, "flagged_collisions": 0})
+    assert (safe.unflagged_collision, safe.collision_flagged) == (Rate(0, 40), None)
+    silent = cell({**MEASURED, "collisions": None, "flagged_collisions": None})
+    assert (silent.flagged, silent.unflagged_collision, silent.collision_flagged) == (
+        Rate(10, 50),
+        None,
+        None,
+    )
+
+
 def test_deviations_are_over_repeats_or_over_training_seeds_the_other_being_averaged() -> None:
     # Collisions of 50 episodes:      repeat 0  repeat 1   rate of the seed
     #                       seed 3        1         3            0.04
@@ -364,6 +458,35 @@ def test_markdown_shows_plans_in_the_wall_if_an_environment_reports_them() -> No
     assert silent_row.endswith("|  |  | 98.00 | 50 |")
 
 
+PLAN_TITLES = "plans | flagged [%] | collisions among the unflagged [%] | colliding episodes flagged [%]"
+MANY = {"n_episodes": 1000, "successes": 1000, "plans_drawn": 10826, "n_plans": 10000, "collisions": 14}
+
+
+def test_markdown_shows_plans_and_flagged_episodes_where_they_were_measured() -> None:
+    some = cell({**MANY, "flagged": 50, "flagged_collisions": 10})
+    safe = cell({**MANY, "collisions": 0, "flagged": 0, "flagged_collisions": 0})
+    head, *rows = markdown_rows(some, safe, cell({}))
+    assert head.endswith(f"| success rate [%] | {PLAN_TITLES} | episodes |")
+    ends = [row.split(" | 100.00 | " if "100.00" in row else " | 98.00 | ")[1] for row in rows]
+    assert ends == [
+        "1.08 | 5.0 (3.8 to 6.5) | 0.42 (0.16 to 1.1) | 71.4 (45.4 to 88.3) | 1000 |",
+        "1.08 | 0.00 (0.00 to 0.38) | 0.00 (0.00 to 0.38) |  | 1000 |",
+        " |  |  |  | 50 |",
+    ]
+
+
+def test_columns_of_flagged_episodes_are_there_only_if_a_cell_has_something_in_them() -> None:
+    silent = cell({**MEASURED, "collisions": None, "flagged_collisions": None})
+    head, row = markdown_rows(silent)
+    assert head.endswith("| success rate [%] | plans | flagged [%] | episodes |")
+    assert row.endswith("| 98.00 | 1.50 | 20.0 (11.2 to 33.0) | 50 |")
+    all_flagged = cell({**MEASURED, "flagged": 50, "flagged_collisions": 8})
+    head, row = markdown_rows(all_flagged)
+    assert head.endswith("| plans | flagged [%] | colliding episodes flagged [%] | episodes |")
+    assert row.endswith("| 1.50 | 100.0 (92.9 to 100.0) | 100.0 (67.6 to 100.0) | 50 |")
+    assert PLAN_TITLES.split(" | ")[1] not in markdown_rows(cell({}))[0]
+
+
 def test_markdown_shows_the_deviation_over_training_seeds_if_there_are_several() -> None:
     seeds = cell(
         *(
@@ -431,6 +554,18 @@ def test_latex_is_the_same_table_with_the_rules_of_booktabs() -> None:
         r"\bottomrule",
         r"\end{tabular}",
     ]
+
+
+def test_latex_shows_plans_and_flagged_episodes_too() -> None:
+    table = make_latex([cell({**MANY, "flagged": 50, "flagged_collisions": 10})]).splitlines()
+    assert table[0] == r"\begin{tabular}{lllllllllllll}"
+    assert table[2].endswith(
+        r"& success rate [\%] & plans & flagged [\%] & collisions among the unflagged [\%] "
+        r"& colliding episodes flagged [\%] & episodes \\"
+    )
+    assert table[4].endswith(
+        r"& 100.00 & 1.08 & 5.0 (3.8 to 6.5) & 0.42 (0.16 to 1.1) & 71.4 (45.4 to 88.3) & 1000 \\"
+    )
 
 
 @pytest.mark.parametrize(

@@ -59,7 +59,7 @@ class BenchmarkSpec:
         policies: Checkpoints (``pretrained_model`` folders or repositories on the Hub) by name. ``{task}`` and ``{seed}``
             in a path stand for the task and the training seed. Policies of any type can be compared.
         guidances: Kinds of guidance for policies that have one. ``none`` is the same policy without
-            guidance.
+            guidance, which draws one plan only, unless the variant names ``max_plans``.
         variants: Changes to the policies' configuration by name; the name "" without changes is the unchanged checkpoint.
         seeds: Training seeds.
         n_repeats: Repeats with other prior noise.

@@ -21,7 +21,8 @@ class BenchmarkConfig:
 
     Called again, it continues where it was interrupted, or adds new results. {seed} and {task} in the path of a checkpoint
     are replaced by the training seed and the task. Policies without guidance, also those of LeRobot itself, are evaluated
-    once for each seed and repeat; pf2mp and dppf policies once for each kind of guidance.
+    once for each seed and repeat; pf2mp and dppf policies once for each kind of guidance. Those check all their plans, and
+    without guidance they draw no other one for a flagged one, unless a variant names max_plans.
 
     Examples:
         pf2mp-benchmark --policies='{pf2mp: outputs/maze_large/checkpoints/last/pretrained_model}' \

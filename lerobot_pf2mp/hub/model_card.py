@@ -327,6 +327,12 @@ def _results(facts: CardFacts) -> list[str]:
             "`pf2mp-benchmark`; all numbers are in [results/summary.csv](results/summary.csv), settings in "
             "[results/run.json](results/run.json)."
         )
+        if "| plans |" in facts.table:
+            sections.append(
+                "plans is the mean number of plans that were drawn for one that was executed. An episode is flagged if one "
+                "of the executed plans still left the demonstrated region; these rates have their Wilson interval in "
+                "brackets."
+            )
     if facts.made_with:
         made_with = ", ".join(f"{name} {value}" for name, value in facts.made_with.items())
         sections.append(f"Measured with {made_with}.")
