@@ -120,6 +120,39 @@ def test_a_rollout_with_real_time_chunking_moves_the_arm_near_the_demonstrations
 
 
 @pytest.mark.parametrize("inference", ["sync", "rtc"])
+def test_a_rollout_is_stopped_before_a_plan_that_nobody_demonstrated(
+    inference: str, demonstrated: tuple[Path, np.ndarray], tmp_path: Path
+) -> None:
+    checkpoint, _ = demonstrated
+    rollout = ForkedCommand(
+        "lerobot-rollout",
+        f"--policy.path={checkpoint}",
+        "--policy.guidance_scale=0",
+        "--policy.on_unsupported=stop",
+        "--device=cpu",
+        "--robot.type=simulated_panda",
+        "--robot.discover_packages_path=simulated_panda",
+        f"--robot.log={tmp_path / 'log.jsonl'}",
+        "--fps=10",
+        "--duration=60",
+        "--play_sounds=false",
+        "--return_to_initial_position=false",
+        f"--inference.type={inference}",
+    )
+    try:
+        said = "".join(rollout.communicate(SECONDS))
+    finally:
+        rollout.kill()
+    assert "leaves the demonstrated region" in said and "on_unsupported=stop" in said
+    assert "Disconnecting robot" in said, said
+    # Nothing of the plan was executed: the robot rests where it was.
+    log = tmp_path / "log.jsonl"
+    assert not log.exists() or not log.read_text()
+    # With real-time chunking LeRobot ends the rollout as finished when its thread gives up.
+    assert inference == "rtc" or rollout.returncode != 0, said
+
+
+@pytest.mark.parametrize("inference", ["sync", "rtc"])
 def test_a_compiled_policy_moves_the_arm_near_the_demonstrations(
     inference: str, demonstrated: tuple[Path, np.ndarray], tmp_path: Path
 ) -> None:
