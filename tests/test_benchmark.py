@@ -373,7 +373,7 @@ def test_variants_change_the_configuration_of_the_policy(
         "few": {"n_field_points": 5, "field_bandwidth": 0.25},
     }
     rows = run(spec_of({"pf2mp": checkpoints["pf2mp"]}, "none", "proximal:0.8", variants=variants), tmp_path)
-    assert loaded == [(2, 3000, "likelihood"), (1, 3000, "likelihood"), (2, 5, 0.25)]
+    assert loaded == [(2, 20000, "likelihood"), (1, 20000, "likelihood"), (2, 5, 0.25)]
 
     unguided = [outcomes(rows, "fmp", variant=variant) for variant in variants]
     guided = [outcomes(rows, "pf2mp", variant=variant) for variant in variants]
