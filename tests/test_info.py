@@ -3,7 +3,9 @@
 
 import importlib.util
 import json
+import logging
 import os
+import re
 import subprocess
 import sys
 import sysconfig
@@ -16,8 +18,10 @@ import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
+from pf2mp_info.checkpoint import checkpoint_lines
 from pf2mp_info.trials import LINES
 from pf2mp_info.versions import EXTRAS, ranges
+from untrained_policies import write_checkpoint
 
 ROOT = Path(__file__).parents[1]
 BIN = Path(sys.executable).parent
@@ -415,3 +419,38 @@ def test_help_of_info_shows_examples_units_and_defaults() -> None:
         "The exit code is 0",
     ):
         assert fact in words
+
+
+def of_checkpoint(checkpoint: Path) -> dict[str, tuple[str, str]]:
+    level = logging.root.manager.disable
+    try:
+        return {
+            line.name: (line.value, line.status + line.remedy) for line in checkpoint_lines(str(checkpoint))
+        }
+    finally:
+        logging.disable(level)
+
+
+def test_of_a_checkpoint_the_report_says_how_its_plans_are_checked(tmp_path: Path) -> None:
+    lines = of_checkpoint(Path(write_checkpoint(tmp_path, "pf2mp")))
+    assert lines["policy"] == ("pf2mp, chunks of 4 actions", "ok")
+    assert re.match(
+        r"\d+ anchors of \d+ episodes in 2 dimensions, h = \S+, safe set: log density", lines["field"][0]
+    )
+    assert lines["guidance"][0] == "proximal, lambda = 0.8, unsupported, quantile 0.95"
+    value, status = lines["plans"]
+    assert re.match(
+        r"log density on the way above \S+, calibrated on \d+ demonstrated plans; at most \S+ % false", value
+    )
+    assert status == "ok" and value.endswith("up to 8 drawn, on_unsupported=ignore")
+
+
+def test_of_a_checkpoint_of_before_the_report_says_that_its_plans_are_not_checked() -> None:
+    lines = of_checkpoint(Path(__file__).parent / "checkpoints/pf2mp")
+    value, status = lines["plans"]
+    assert value == "not checked" and status.startswith("optional") and "pf2mp-fit-field" in status
+
+
+def test_a_checkpoint_that_cannot_be_loaded_is_a_problem_in_one_line(tmp_path: Path) -> None:
+    ((value, status),) = of_checkpoint(tmp_path / "nothing").values()
+    assert value == "cannot be loaded" and status.startswith("problem") and "\n" not in status

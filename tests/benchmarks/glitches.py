@@ -61,7 +61,7 @@ def main(config: GlitchesConfig) -> None:
         tasks=(config.task,),
         policies=policies,
         guidances=tuple(Guidance.parse("proximal:0.8")),
-        variants={"": {}},
+        variants={"": {"max_plans": 1, "guidance_region": "everywhere"}},  # what the field alone does
         seeds=(0,),
         n_repeats=1,
         n_episodes=config.n_episodes,
@@ -87,7 +87,7 @@ def write_checkpoint(
     points[wrong, coordinate] = sign * size
     demonstrations.load_state_dict({**state, "points": points})
     demonstrations.settings = replace(demonstrations.settings, leave_out=leave_out)
-    demonstrations._fitted = None  # the state holds the field of the right values
+    demonstrations._forget_field()  # the state holds that of the right values
     preprocessor.save_pretrained(folder)
     written = json.loads((folder / "config.json").read_text(encoding="utf-8"))
     written["field_leave_out"] = leave_out

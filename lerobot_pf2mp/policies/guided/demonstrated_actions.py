@@ -16,7 +16,7 @@ from lerobot_pf2mp.policies.guided.field_state import ANCHOR, OUTLYING, SAFE_ANC
 from lerobot_pf2mp.policies.guided.frame_ranks import frame_of, rank_of
 from lerobot_pf2mp.policies.guided.recorded_angles import JUMP, steps_seen
 from lerobot_pf2mp.policies.guided.remarks import remarks_on_dimensions, remarks_on_outlying
-from lerobot_pf2mp.policies.plans.demonstrated_plans import DemonstratedPlans, states_are_places
+from lerobot_pf2mp.policies.plans.demonstrated_plans import DemonstratedPlans
 from lerobot_pf2mp.policies.plans.plan_threshold import PlanThreshold
 from lerobot_pf2mp.potential_field import (
     JudgedFit,
@@ -74,7 +74,11 @@ class DemonstratedActions:
         self._fitted: tuple[FieldSettings, PotentialField] | None = None
         self._is_outlying = torch.empty(0, dtype=torch.bool)  # (P,) of the fitted field's points
         self._held_out = torch.empty(0)  # (N,) log densities of its points without their own episodes [nats]
+        self._forget_plan_scores()
+
+    def _forget_plan_scores(self) -> None:
         self._plan_scores: tuple[FieldSettings, int, Tensor] | None = None  # and for how many actions
+        self._threshold: tuple[tuple[FieldSettings, int, float], PlanThreshold] | None = None  # the last one
 
     def __len__(self) -> int:
         return len(self._ranks)
@@ -200,7 +204,7 @@ class DemonstratedActions:
             start = self.place_of(states.detach().to(start))
         ways = torch.cat([start.unsqueeze(1), actions], dim=1)
         if self.plans.observe(ways, episodes.reshape(-1), frames.reshape(-1)):
-            self._plan_scores = None
+            self._forget_plan_scores()
 
     def place_of(self, states: Tensor) -> Tensor:
         """Where a robot is, as an action over the field's dimensions, ``(B, D)`` [normalised].
@@ -268,6 +272,9 @@ class DemonstratedActions:
         Raises:
             ValueError: If there are no demonstrated plans, none that other episodes can judge, or they have fewer actions.
         """
+        asked = settings, n_actions, false_alarm_rate
+        if self._threshold is not None and self._threshold[0] == asked:
+            return self._threshold[1]  # as in nearly every call of a policy
         self._check(settings)
         remedy = "pf2mp-fit-field makes a field that has them, and max_plans=1 with on_unsupported=ignore needs none"
         if not len(self.plans) or self.episodes is None:
@@ -287,12 +294,13 @@ class DemonstratedActions:
                 "the check of plans needs demonstrations that other episodes can judge, got a potential field in which "
                 f"nothing is left without a plan's own episode: more demonstrations, or {remedy}"
             )
-        return PlanThreshold.of(known[2], false_alarm_rate)
+        self._threshold = asked, PlanThreshold.of(known[2], false_alarm_rate)
+        return self._threshold[1]
 
     @property
     def starts_at_state(self) -> bool:
         """Whether an observed state tells where the robot is, in the units of its actions."""
-        return bool(self._places.numel()) and len(self.plans) > 0 and states_are_places(self.plans.ways)
+        return bool(self._places.numel()) and self.plans.begin_where_robots_are
 
     def _score_plans(self, settings: FieldSettings, n_actions: int) -> Tensor:
         field = self.field(settings)
@@ -380,7 +388,7 @@ class DemonstratedActions:
         self._dataset_id = bytes(read.dataset_id.tolist())
         self._places, self._n_executed = read.places, int(read.n_executed)
         self.plans.restore(read.plans, read.plan_episodes, read.plan_ranks)
-        self._plan_scores = None
+        self._forget_plan_scores()
         if len(read.plan_scores):
             self._plan_scores = self.settings, self._n_executed, read.plan_scores
         role = read.role[: self.settings.n_points]

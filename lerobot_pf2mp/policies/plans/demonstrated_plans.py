@@ -48,6 +48,7 @@ class DemonstratedPlans:
         self.ways = torch.empty(0, 0, 0)  # (E, T + 1, D) where the robot was, then T actions [normalised]
         self.episodes = torch.empty(0, dtype=torch.int64)  # (E,)
         self.ranks = torch.empty(0, dtype=torch.int64)  # (E,) of the first frames
+        self._begin_where_robots_are: bool | None = None
 
     def __len__(self) -> int:
         return len(self.ranks)
@@ -60,6 +61,14 @@ class DemonstratedPlans:
     def restore(self, ways: Tensor, episodes: Tensor, ranks: Tensor) -> None:
         """Restores plans that were saved."""
         self.ways, self.episodes, self.ranks = ways, episodes, ranks
+        self._begin_where_robots_are = None
+
+    @property
+    def begin_where_robots_are(self) -> bool:
+        """Whether ways begin at states that are places in the units of the actions, see `states_are_places`."""
+        if self._begin_where_robots_are is None:
+            self._begin_where_robots_are = len(self) > 0 and states_are_places(self.ways)
+        return self._begin_where_robots_are
 
     def observe(self, ways: Tensor, episodes: Tensor, frames: Tensor) -> bool:
         """Adds plans of a training batch, and returns whether that changed the sample.
@@ -84,7 +93,7 @@ class DemonstratedPlans:
                 for old, new in zip(known, (ways, episodes, ranks), strict=True)
             )
         order = _chosen(episodes, ranks)
-        self.ways, self.episodes, self.ranks = ways[order], episodes[order], ranks[order]
+        self.restore(ways[order], episodes[order], ranks[order])
         return True
 
     @staticmethod
