@@ -230,7 +230,8 @@ def test_calibration_is_saved_and_restored_with_the_field() -> None:
     state = kept.state_dict()
     restored = DemonstratedActions(kept.settings)
     restored.load_state_dict(state)
-    assert restored._plan_scores is not None and len(restored._plan_scores[2]) == 20
+    scores = restored.calibration._scores
+    assert scores is not None and len(scores[2]) == 20
     for n_actions in (5, HORIZON):
         found = restored.plan_threshold(kept.settings, n_actions, 0.1)
         assert found == kept.plan_threshold(kept.settings, n_actions, 0.1)
@@ -243,11 +244,11 @@ def test_states_in_other_units_are_not_where_the_robot_is() -> None:
     places = torch.stack([torch.ones(2), torch.zeros(2)])
     chunks = episodes.unfold(1, HORIZON, 1).transpose(2, 3)
     states = chunks[:, :, 0].reshape(-1, 2)
-    assert demonstrated(episodes, states=states, places=places).starts_at_state
+    assert demonstrated(episodes, states=states, places=places).calibration.starts_at_state
     in_degrees = torch.stack([torch.full((2,), 57.3), torch.zeros(2)])
-    assert not demonstrated(episodes, states=states, places=in_degrees).starts_at_state
-    assert not demonstrated(episodes, states=-states, places=places).starts_at_state
-    assert not demonstrated(episodes).starts_at_state
+    assert not demonstrated(episodes, states=states, places=in_degrees).calibration.starts_at_state
+    assert not demonstrated(episodes, states=-states, places=places).calibration.starts_at_state
+    assert not demonstrated(episodes).calibration.starts_at_state
 
 
 # The choice among plans.
@@ -564,7 +565,7 @@ def test_plans_that_cannot_be_checked_are_said_once_and_an_error_if_asked_for(
 ) -> None:
     policy = policy_of("pf2mp")
     batch = batch_for(policy)
-    batch[POTENTIAL_FIELD].plans.forget()
+    batch[POTENTIAL_FIELD].calibration.plans.forget()
     with caplog.at_level(logging.WARNING):
         for _ in range(3):
             policy.predict_action_chunk(batch)

@@ -73,7 +73,7 @@ def _field_lines(config: Any, preprocessor: Any) -> Iterator[Line]:
     )
     place = (
         "the observed state"
-        if demonstrations.starts_at_state
+        if demonstrations.calibration.starts_at_state
         else ("the first action, as the observed state is not in the units of the actions")
     )
     yield Line("way of a plan", f"begins at the last executed action; in the first plan at {place}")

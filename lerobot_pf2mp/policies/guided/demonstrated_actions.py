@@ -6,16 +6,18 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import replace
+from typing import cast
 
 import torch
 from torch import Tensor
 
 from lerobot_pf2mp.density.held_out import HeldOut, group_numbers
-from lerobot_pf2mp.policies.guided.field_settings import FieldSettings, has_same_density
+from lerobot_pf2mp.policies.guided.field_settings import FieldSettings, density_of
 from lerobot_pf2mp.policies.guided.field_state import ANCHOR, OUTLYING, SAFE_ANCHOR, FieldState
 from lerobot_pf2mp.policies.guided.frame_ranks import frame_of, rank_of
 from lerobot_pf2mp.policies.guided.recorded_angles import JUMP, steps_seen
 from lerobot_pf2mp.policies.guided.remarks import remarks_on_dimensions, remarks_on_outlying
+from lerobot_pf2mp.policies.plans.calibration import PlanCalibration
 from lerobot_pf2mp.policies.plans.demonstrated_plans import DemonstratedPlans
 from lerobot_pf2mp.policies.plans.plan_threshold import PlanThreshold
 from lerobot_pf2mp.potential_field import (
@@ -51,7 +53,6 @@ class DemonstratedActions:
     def _forget_units(self) -> None:
         self._unit = torch.empty(0)  # (D,) one recorded unit [normalised]; empty if unknown
         self._steps = torch.empty(0, dtype=torch.uint8)  # (D,) `steps_seen` so far; empty if unknown
-        self._places = torch.empty(0, 0)  # (2, D) see `places_of_states`
 
     def _start_afresh(self, dataset_id: bytes, why: str = "") -> None:
         if why:
@@ -66,19 +67,14 @@ class DemonstratedActions:
         self._ranks = torch.empty(0, dtype=torch.int64)  # (P,) ascending
         self._points = torch.empty(0, 0)  # (P, D), in the order of the ranks
         self._episodes = torch.empty(0, dtype=torch.int64)  # (P,) -1 if unknown
-        self.plans = DemonstratedPlans()
-        self._n_executed = 1  # actions of a plan that training's policy executes
+        self.calibration = PlanCalibration()
         self._forget_field()
 
     def _forget_field(self) -> None:
         self._fitted: tuple[FieldSettings, PotentialField] | None = None
         self._is_outlying = torch.empty(0, dtype=torch.bool)  # (P,) of the fitted field's points
         self._held_out = torch.empty(0)  # (N,) log densities of its points without their own episodes [nats]
-        self._forget_plan_scores()
-
-    def _forget_plan_scores(self) -> None:
-        self._plan_scores: tuple[FieldSettings, int, Tensor] | None = None  # and for how many actions
-        self._threshold: tuple[tuple[FieldSettings, int, float], PlanThreshold] | None = None  # the last one
+        self.calibration.forget_scores()
 
     def __len__(self) -> int:
         return len(self._ranks)
@@ -192,19 +188,16 @@ class DemonstratedActions:
             places: As there.
             n_executed: As there.
         """
-        self._n_executed = n_executed
-        if not len(actions):
-            return
         dims = self.settings.action_dims
-        actions = _select_dims(actions.detach().float(), dims)
-        start = actions[:, 0]
-        self._places = torch.empty(0, 0)
-        if places is not None and places.numel() and states is not None:
-            self._places = torch.stack([_select_dims(row, dims) for row in places.cpu()])
-            start = self.place_of(states.detach().to(start))
-        ways = torch.cat([start.unsqueeze(1), actions], dim=1)
-        if self.plans.observe(ways, episodes.reshape(-1), frames.reshape(-1)):
-            self._forget_plan_scores()
+        is_known = states is not None and places is not None and bool(places.numel())
+        self.calibration.observe(
+            _select_dims(actions.detach().float(), dims),
+            frames,
+            episodes,
+            states=_select_dims(cast(Tensor, states), dims) if is_known else None,
+            places=_select_dims(cast(Tensor, places), dims) if is_known else None,
+            n_executed=n_executed,
+        )
 
     def place_of(self, states: Tensor) -> Tensor:
         """Where a robot is, as an action over the field's dimensions, ``(B, D)`` [normalised].
@@ -212,8 +205,7 @@ class DemonstratedActions:
         Args:
             states: ``(B, A)`` observed states [normalised], of which `places` are known.
         """
-        factors, offsets = self._places.to(states)
-        return factors * _select_dims(states, self.settings.action_dims) + offsets
+        return self.calibration.place_of(_select_dims(states, self.settings.action_dims))
 
     def recognise_angles(self, actions: Tensor, is_pad: Tensor | None, unit: Tensor) -> None:
         """Looks for jumps by a period in successive actions, which make their dimension an angle.
@@ -251,7 +243,7 @@ class DemonstratedActions:
         settings = settings or self.settings
         self._check(settings)
         if self._fitted is None or self._fitted[0] != settings:
-            if self._fitted is not None and has_same_density(self._fitted[0], settings):
+            if self._fitted is not None and density_of(self._fitted[0]) == density_of(settings):
                 field = self._fitted[1]
             else:
                 field = self._fit(settings)
@@ -272,46 +264,25 @@ class DemonstratedActions:
         Raises:
             ValueError: If there are no demonstrated plans, none that other episodes can judge, or they have fewer actions.
         """
-        asked = settings, n_actions, false_alarm_rate
-        if self._threshold is not None and self._threshold[0] == asked:
-            return self._threshold[1]  # as in nearly every call of a policy
         self._check(settings)
-        remedy = "pf2mp-fit-field makes a field that has them, and max_plans=1 with on_unsupported=ignore needs none"
-        if not len(self.plans) or self.episodes is None:
-            raise ValueError(
-                f"the check of plans needs demonstrated plans, got a potential field without them: {remedy}"
-            )
-        if n_actions > self.plans.n_actions:
-            raise ValueError(
-                f"the check of plans needs demonstrated plans of {n_actions} actions, got a potential field with plans of "
-                f"{self.plans.n_actions}: {remedy}"
-            )
-        known = self._plan_scores
-        if known is None or known[1] != n_actions or not has_same_density(known[0], settings):
-            known = self._plan_scores = settings, n_actions, self._score_plans(settings, n_actions)
-        if not len(known[2]):
-            raise ValueError(
-                "the check of plans needs demonstrations that other episodes can judge, got a potential field in which "
-                f"nothing is left without a plan's own episode: more demonstrations, or {remedy}"
-            )
-        self._threshold = asked, PlanThreshold.of(known[2], false_alarm_rate)
-        return self._threshold[1]
-
-    @property
-    def starts_at_state(self) -> bool:
-        """Whether an observed state tells where the robot is, in the units of its actions."""
-        return bool(self._places.numel()) and self.plans.begin_where_robots_are
+        return self.calibration.threshold(
+            density_of(settings),
+            n_actions,
+            false_alarm_rate,
+            lambda: self._score_plans(settings, n_actions),
+            can_judge=self.episodes is not None,
+        )
 
     def _score_plans(self, settings: FieldSettings, n_actions: int) -> Tensor:
         field = self.field(settings)
         is_anchor = ~self._is_outlying
         episodes = self.episodes if settings.leave_out == "episode" else None
-        return self.plans.scores(
+        return self.calibration.plans.scores(
             field,
             None if episodes is None else episodes[: settings.n_points][is_anchor],
             self.frames[: settings.n_points][is_anchor],
             n_actions,
-            starts_at_state=self.starts_at_state,
+            starts_at_state=self.calibration.starts_at_state,
         )
 
     def _on_density(self, field: PotentialField, settings: FieldSettings) -> PotentialField:
@@ -344,6 +315,12 @@ class DemonstratedActions:
         if not len(self):
             return {}
         field = self.field()
+        calibration, n_executed = self.calibration, self.calibration.n_executed
+        scores = torch.empty(0)
+        if n_executed <= calibration.plans.n_actions and self.episodes is not None:
+            scores = calibration.scores(
+                density_of(self.settings), n_executed, lambda: self._score_plans(self.settings, n_executed)
+            )
         is_outlying = self._is_outlying
         role = torch.where(is_outlying, OUTLYING, ANCHOR).to(torch.uint8)
         role[~is_outlying] += field.safe_anchors.cpu().to(torch.uint8)
@@ -358,13 +335,13 @@ class DemonstratedActions:
             unit=self._unit.clone(),
             steps=self._steps.clone(),
             role=role,
-            places=self._places.clone(),
+            places=calibration.places.clone(),
             held_out=self._held_out.cpu().contiguous(),
-            plans=self.plans.ways.cpu().contiguous(),
-            plan_episodes=self.plans.episodes.cpu().contiguous(),
-            plan_ranks=self.plans.ranks.cpu().contiguous(),
-            plan_scores=self._scores_to_save(),
-            n_executed=torch.tensor(self._n_executed),
+            plans=calibration.plans.ways.cpu().contiguous(),
+            plan_episodes=calibration.plans.episodes.cpu().contiguous(),
+            plan_ranks=calibration.plans.ranks.cpu().contiguous(),
+            plan_scores=scores,
+            n_executed=torch.tensor(n_executed),
         ).tensors()
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
@@ -386,11 +363,11 @@ class DemonstratedActions:
         self._unit, self._steps = read.unit.float(), read.steps
         self._n_shown = int(read.n_shown)
         self._dataset_id = bytes(read.dataset_id.tolist())
-        self._places, self._n_executed = read.places, int(read.n_executed)
-        self.plans.restore(read.plans, read.plan_episodes, read.plan_ranks)
-        self._forget_plan_scores()
-        if len(read.plan_scores):
-            self._plan_scores = self.settings, self._n_executed, read.plan_scores
+        plans = DemonstratedPlans()
+        plans.restore(read.plans, read.plan_episodes, read.plan_ranks)
+        self.calibration.restore(
+            plans, read.places, int(read.n_executed), density_of(self.settings), read.plan_scores
+        )
         role = read.role[: self.settings.n_points]
         self._is_outlying, self._held_out = role == OUTLYING, read.held_out
         field = PotentialField(
@@ -403,14 +380,6 @@ class DemonstratedActions:
             anchor_is_safe=role[~self._is_outlying] == SAFE_ANCHOR if "role" in state else None,
         )
         self._fitted = (self.settings, self._on_density(field, self.settings))
-
-    def _scores_to_save(self) -> Tensor:
-        if not len(self.plans) or self.episodes is None or self._n_executed > self.plans.n_actions:
-            return torch.empty(0)
-        known = self._plan_scores
-        if known is not None and known[:2] == (self.settings, self._n_executed):
-            return known[2]
-        return self._score_plans(self.settings, self._n_executed)
 
     def _check(self, settings: FieldSettings) -> None:
         if not len(self):

@@ -289,7 +289,7 @@ class FieldGuidance:
         if not isinstance(demonstrations, DemonstratedActions) or states is None:
             return first
         states = states[:, -1] if states.ndim == 3 else states
-        if not demonstrations.starts_at_state or states.shape != first.shape:
+        if not demonstrations.calibration.starts_at_state or states.shape != first.shape:
             return first
         place = demonstrations.place_of(states.to(first))
         dims = self.config.field_settings.action_dims

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 from lerobot_pf2mp.density.bandwidth import DEFAULT_BANDWIDTH, check_bandwidth_rule
 from lerobot_pf2mp.potential_field import (
@@ -78,11 +79,10 @@ class FieldSettings:
         check_alpha(self.alpha, "field_alpha")
 
 
-def has_same_density(first: FieldSettings, second: FieldSettings) -> bool:
-    """Whether two settings differ at most in what is built on the density: the distance term and where the field pulls."""
-    return replace(first, alpha=0.0, region="everywhere", quantile=0.5) == replace(
-        second, alpha=0.0, region="everywhere", quantile=0.5
-    )
+@lru_cache(maxsize=64)
+def density_of(settings: FieldSettings) -> FieldSettings:
+    """The settings without what is built on the density: the distance term and where the field pulls."""
+    return replace(settings, alpha=0.0, region=REGIONS[0], quantile=0.5)
 
 
 def _check_dims(name: str, dims: tuple[int, ...]) -> None:

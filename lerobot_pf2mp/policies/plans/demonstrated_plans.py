@@ -55,8 +55,8 @@ class DemonstratedPlans:
 
     @property
     def n_actions(self) -> int:
-        """The number of actions T of a plan."""
-        return self.ways.shape[1] - 1
+        """The number of actions T of a plan; 0 if there is none."""
+        return max(self.ways.shape[1] - 1, 0)
 
     def restore(self, ways: Tensor, episodes: Tensor, ranks: Tensor) -> None:
         """Restores plans that were saved."""
