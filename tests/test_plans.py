@@ -530,6 +530,22 @@ def test_without_a_state_the_way_begins_at_the_first_action() -> None:
     assert torch.equal(held, first.expand_as(held))
 
 
+def test_a_state_in_other_units_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
+    policy = policy_of("pf2mp", max_plans=1, on_unsupported="warn", guidance_scale=0.0)
+    batch = batch_for(policy, places=torch.stack([torch.full((2,), 57.3), torch.zeros(2)]))
+    with caplog.at_level(logging.WARNING):
+        for _ in range(3):
+            policy.predict_action_chunk(batch)
+    assert sum("observation.state is not in the units of action" in r.message for r in caplog.records) == 1
+
+
+@pytest.mark.parametrize("kind", ["pf2mp", "dppf"])
+def test_a_plan_of_one_action_is_checked_too(kind: str) -> None:
+    policy = policy_of(kind, n_action_steps=1, guidance_scale=0.0)
+    policy.select_action(batch_for(policy))
+    assert policy.support.shape == (1, 1) and policy.plans.n_drawn.tolist() == [8]
+
+
 def test_another_number_of_robots_needs_a_reset() -> None:
     policy = policy_of("pf2mp", max_plans=1, on_unsupported="warn")
     for _ in range(N_EXECUTED):

@@ -64,7 +64,7 @@ class FieldGuidance:
         self.demonstrations: DemonstratedActions | None = None  # those of the last training batch
         # Whether plans are checked even if nothing acts on it: `plans` then tells of them.
         self.measures_plans = False
-        self._has_warned = False
+        self._said: set[str] = set()
         self._made: tuple[PotentialField, GuidanceSettings, Guide | None] | None = None
         self.reset()
 
@@ -260,11 +260,14 @@ class FieldGuidance:
         except ValueError as error:
             if is_asked_for:
                 raise
-            if not self._has_warned:
-                logger.warning("Plans are not checked, and none is drawn again: %s", error)
-                self._has_warned = True
+            self._warn_once("Plans are not checked, and none is drawn again: %s", error)
             return None
         return PlanCheck(field, threshold.log_density, config.field_settings.action_dims)
+
+    def _warn_once(self, message: str, *arguments: object) -> None:
+        if message not in self._said:
+            self._said.add(message)
+            logger.warning(message, *arguments)
 
     def _places_of_robots(self, batch: dict[str, Any], chunk: Tensor) -> Tensor:
         """Where the robots are when they begin to execute a chunk, as actions ``(B, A)`` [normalised].
@@ -289,7 +292,15 @@ class FieldGuidance:
         if not isinstance(demonstrations, DemonstratedActions) or states is None:
             return first
         states = states[:, -1] if states.ndim == 3 else states
-        if not demonstrations.calibration.starts_at_state or states.shape != first.shape:
+        calibration = demonstrations.calibration
+        if not calibration.starts_at_state or states.shape != first.shape:
+            if calibration.places.numel():
+                self._warn_once(
+                    "%s is not in the units of %s: the way of a first plan begins at its first action, not where the robot "
+                    "is seen.",
+                    OBS_STATE,
+                    ACTION,
+                )
             return first
         place = demonstrations.place_of(states.to(first))
         dims = self.config.field_settings.action_dims
