@@ -151,7 +151,10 @@ def moved_table(found: dict[str, Any]) -> str:
         yield f"|---|{'---|' * len(found)}"
         for region in next(iter(found.values()))["moved"]:
             cells = [
-                ", ".join(f"{1000 * task['moved'][region][key]:.2g}" for key in ("mean", "last", "largest"))
+                ", ".join(
+                    f"{float(f'{1000 * task["moved"][region][key]:.2g}'):g}"
+                    for key in ("mean", "last", "largest")
+                )
                 for task in found.values()
             ]
             yield f"| {region} | {' | '.join(cells)} |"

@@ -96,7 +96,7 @@ class FieldGuidance:
         """Adds the actions of a training batch to the field in that batch. A batch without a field changes nothing.
 
         With several processes, the field of each process gets the batches of all, because only the main process saves its
-        field. They exchange B x (T x (4 A + 1) + 16) bytes in every step, which is little compared with the gradients.
+        field. They exchange B x (T x (4 A + 1) + 4 A + 16) bytes in every step, which is little compared with the gradients.
 
         Args:
             batch: A training batch that the policy's own preprocessor has made.
