@@ -481,6 +481,44 @@ def test_other_plans_continue_the_same_randomness(kind: str) -> None:
     torch.testing.assert_close(chosen, candidates[torch.arange(2), best], atol=1e-5, rtol=1e-4)
 
 
+@pytest.mark.parametrize("kind", ["pf2mp", "dppf"])
+@pytest.mark.parametrize("n_obs_steps", [1, 2])
+@pytest.mark.parametrize("in_queues", [True, False])
+def test_plans_from_images_are_drawn_again_from_the_robots_own_observations(
+    kind: str, n_obs_steps: int, in_queues: bool
+) -> None:
+    image = "observation.images.front"
+    inputs = {
+        STATE: PolicyFeature(FeatureType.STATE, (2,)),
+        image: PolicyFeature(FeatureType.VISUAL, (3, 64, 64)),
+    }
+    options = {"crop_shape": None, "pretrained_backbone_weights": None} if kind == "dppf" else {}
+    policy = policy_of(
+        kind, n_obs_steps=n_obs_steps, input_features=inputs, max_plans=3, guidance_scale=0.0, **options
+    )
+    batch = {key: value for key, value in batch_for(policy, n_robots=3).items() if key != ENV}
+    batch[image] = torch.rand(3, 3, 64, 64, generator=torch.Generator().manual_seed(1))
+    torch.manual_seed(5)
+    if in_queues:
+        policy.select_action(dict(batch))
+        chosen = torch.stack(list(policy._queues["action"]), dim=1)
+    else:
+        chosen = policy.predict_action_chunk(dict(batch))[:, 1:]
+    assert policy.plans.n_drawn.tolist() == [3, 3, 3]
+    # The second robot alone, with the noise that it had among the three.
+    policy.reset()
+    torch.manual_seed(5)
+    horizon = (3, HORIZON, 2)
+    noise = [torch.randn(horizon), torch.randn(9 - 3, HORIZON, 2)]
+    rows = torch.cat([noise[0][1:2], noise[1][2:4]])
+    one = {
+        key: value[1:2].expand(3, *value.shape[1:]) for key, value in batch.items() if key != POTENTIAL_FIELD
+    }
+    policy.config.max_plans = 1
+    plans = policy.predict_action_chunk({**one, POTENTIAL_FIELD: batch[POTENTIAL_FIELD]}, noise=rows)
+    assert any(torch.allclose(chosen[1], plan[1:], atol=1e-4) for plan in plans)
+
+
 def test_a_generator_of_ones_own_draws_all_plans() -> None:
     policy = policy_of("pf2mp", max_plans=4)
     batch, chunks = batch_for(policy), []

@@ -73,7 +73,10 @@ def run_demo(
 
     episodes: list[EpisodeRow] = []
     for stage, (name, guidance_scale) in enumerate(
-        (("FMP: guidance off", 0.0), ("PF2MP: the same weights with guidance", DEFAULT_GUIDANCE_SCALE)),
+        (
+            ("FMP: guidance off, one plan", 0.0),
+            ("PF2MP: the same weights with guidance and checked plans", DEFAULT_GUIDANCE_SCALE),
+        ),
         start=3,
     ):
         _say(stage, f"Evaluation of {name}, {n_episodes} episodes")
@@ -173,6 +176,7 @@ def _evaluate(
             "lerobot-eval",
             f"--policy.path={checkpoint}",
             f"--policy.guidance_scale={guidance_scale:g}",
+            *([] if guidance_scale else ["--policy.max_plans=1"]),
             "--env.type=pf2mp_maze",
             f"--env.task={env_task}",
             f"--eval.n_episodes={n_episodes}",

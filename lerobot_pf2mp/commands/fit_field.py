@@ -25,6 +25,16 @@ class FitFieldPolicyConfig:
     guidance_scale: float | None = None
     # proximal or euler.
     guidance_integrator: str | None = None
+    # Where the field pulls: everywhere, unsupported or fading.
+    guidance_region: str | None = None
+    # Quantile of the demonstrated actions' densities above which it does not.
+    guidance_quantile: float | None = None
+    # Largest number of plans drawn for one that is executed.
+    max_plans: int | None = None
+    # Largest probability with which a plan as good as a fresh demonstration is flagged.
+    false_alarm_rate: float | None = None
+    # What happens if the best of these plans is still flagged: ignore, warn, hold or stop.
+    on_unsupported: str | None = None
     # Demonstrated actions kept as anchors of the field.
     n_field_points: int | None = None
     # Action dimensions that the field covers; by default all.
@@ -103,7 +113,7 @@ def main(config: FitFieldConfig) -> None:
         "options": options,
     }
     if path is None:
-        of_policy = [f"--policy.{name}" for name in options if name.startswith("guidance_")]
+        of_policy = [f"--policy.{name}" for name in options if not name.startswith(("field_", "n_field_"))]
         if chosen["checkpoint_revision"] is not None:
             of_policy.append("--policy.revision")
         if of_policy:

@@ -237,8 +237,10 @@ class GuidedPolicyFigures:
     def _roll_out(
         self, n_episodes: int, guidance_scale: float, on_step: Callable[[Any], None] | None = None
     ) -> tuple[list[Path2D], list[np.ndarray | None]]:
-        configured = self._config.guidance_scale
+        configured = {name: getattr(self._config, name) for name in ("guidance_scale", "max_plans")}
         self._config.guidance_scale = guidance_scale
+        if guidance_scale == 0:
+            self._config.max_plans = 1  # the unguided policy
         env_processors = make_env_pre_post_processors(self._env, self._config)
         env = self._make_env(n_episodes)
         pens: list[np.ndarray] = []
@@ -264,7 +266,8 @@ class GuidedPolicyFigures:
                 )
         finally:
             env.close()
-            self._config.guidance_scale = configured
+            for name, value in configured.items():
+                setattr(self._config, name, value)
         observations = result["observation"]
         lengths = result["done"].int().argmax(dim=1) + 1
         # Joint positions cannot be drawn in a scene; positions of the pen can.

@@ -31,7 +31,8 @@ _GENERATES = {
 _GUIDED = (
     "While it does so, a potential field, fitted to the demonstrated actions alone, steers every action back to where the "
     "demonstrations went, and so away from obstacles that nobody has modelled. The field is part of this repository and "
-    "comes with the preprocessor; `--policy.guidance_scale=0` turns it off. The method is *Towards Safe Imitation Learning "
+    "comes with the preprocessor; `--policy.guidance_scale=0` turns it off. Every plan is checked with it before it is "
+    "executed, and drawn again if it leaves the demonstrated region. The method is *Towards Safe Imitation Learning "
     "via Potential Field-Guided Flow Matching* (Ding et al., IROS 2025, [arXiv:2508.08707]"
     "(https://arxiv.org/abs/2508.08707))."
 )
