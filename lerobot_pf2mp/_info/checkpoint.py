@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import sys
 from collections.abc import Iterator
 from contextlib import redirect_stdout
@@ -52,7 +53,7 @@ def _field_lines(config: Any, preprocessor: Any) -> Iterator[Line]:
         f"{len(field.anchors)} anchors{from_episodes} in {field.dim} dimensions, h = {field.bandwidth:.4g}, safe set: "
         f"log density above {field.log_threshold:.4g}",
     )
-    region = config.guidance_region
+    region = config.guidance_region if math.isfinite(field.log_no_pull) else "everywhere"
     where = region if region == "everywhere" else f"{region}, quantile {config.guidance_quantile:g}"
     yield Line("guidance", f"{config.guidance_integrator}, lambda = {config.guidance_scale:g}, {where}")
     try:

@@ -11,7 +11,6 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from lerobot_pf2mp.density.held_out import HeldOut, group_numbers
 from lerobot_pf2mp.policies.guided.field_settings import FieldSettings, density_of
 from lerobot_pf2mp.policies.guided.field_state import ANCHOR, OUTLYING, SAFE_ANCHOR, FieldState
 from lerobot_pf2mp.policies.guided.frame_ranks import frame_of, rank_of
@@ -288,9 +287,8 @@ class DemonstratedActions:
     def _on_density(self, field: PotentialField, settings: FieldSettings) -> PotentialField:
         """The field with the distance term, and pulling where the settings say."""
         full = none = math.inf
-        if settings.region != "everywhere":
-            if not len(self._held_out):  # the file of a field from before 0.2
-                self._held_out = _held_out_log_density(field, self.episodes, self.frames[: settings.n_points])
+        # The file of a field from before 0.2 does not tell where support is missing. It pulls everywhere, as it did.
+        if settings.region != "everywhere" and len(self._held_out):
             none = just_below_quantile(self._held_out, settings.quantile)
             full = none if settings.region == "unsupported" else min(field.log_threshold, none)
         return replace(field, alpha=settings.alpha, log_full_pull=full, log_no_pull=none)
@@ -477,17 +475,6 @@ class DemonstratedActions:
         self._points = points[order][is_first][:n_points]
         self._episodes = episodes[order][is_first][:n_points]
         self._forget_field()
-
-
-def _held_out_log_density(field: PotentialField, episodes: Tensor | None, frames: Tensor) -> Tensor:
-    """The log densities of a field's anchors, each without its own episode, ``(M,)``."""
-    anchors = field.anchors.cpu()
-    groups = group_numbers(len(anchors), episodes, frames)
-    held_out = HeldOut(anchors, groups, field.periods, frames)
-    if not held_out.can_judge:
-        return field.log_density(anchors)
-    log_density = held_out.judge(field.bandwidth).log_density
-    return log_density[log_density.isfinite()].float()
 
 
 def _select_dims(actions: Tensor, dims: tuple[int, ...] | None) -> Tensor:
