@@ -130,7 +130,7 @@ def test_the_flow_ends_with_the_chunks_that_the_policy_predicts(checkpoint: str)
     np.testing.assert_allclose(starts, observation[STATE])
     np.testing.assert_allclose(goals, observation["observation.environment_state"])
     for scale, trace in ((0.0, unguided), (0.8, guided)):
-        policy, preprocess, _ = load_policy(checkpoint, device="cpu", guidance_scale=scale)
+        policy, preprocess, _ = load_policy(checkpoint, device="cpu", guidance_scale=scale, max_plans=1)
         chunk = policy.predict_action_chunk(preprocess({**observation, "task": [""] * 3}), noise=trace[0])
         # LeRobot's diffusion returns the part that is executed, which begins at the last observation.
         first = policy.config.n_obs_steps - 1 if policy.config.type == "dppf" else 0

@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Sequence
-from contextlib import redirect_stderr
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr
 from pathlib import Path
 from typing import Any
 
@@ -225,10 +225,21 @@ class GuidedPolicyFigures:
         for guide in (None, self._policy.guidance.guide(batch, noise.device)):
             trace = _Trace(guide)
             self._policy.reset()
-            self._policy.predict_action_chunk(batch, noise=noise, guide=trace)
+            with self._changed(max_plans=1):  # the steps of one plan, whether or not it would be drawn again
+                self._policy.predict_action_chunk(batch, noise=noise, guide=trace)
             traces.append(torch.stack([noise, *trace.chunks]))
         goals = raw[OBS_ENV_STATE].numpy() if OBS_ENV_STATE in raw else None
         return traces[0], traces[1], raw[OBS_STATE].numpy(), goals
+
+    @contextmanager
+    def _changed(self, **options: Any) -> Iterator[None]:
+        """Other options of the policy in this block."""
+        configured = {name: getattr(self._config, name) for name in options}
+        vars(self._config).update(options)
+        try:
+            yield
+        finally:
+            vars(self._config).update(configured)
 
     def _make_env(self, n_envs: int) -> gym.vector.VectorEnv:
         (env,) = next(iter(self._env.create_envs(n_envs, use_async_envs=False).values())).values()
@@ -237,10 +248,8 @@ class GuidedPolicyFigures:
     def _roll_out(
         self, n_episodes: int, guidance_scale: float, on_step: Callable[[Any], None] | None = None
     ) -> tuple[list[Path2D], list[np.ndarray | None]]:
-        configured = {name: getattr(self._config, name) for name in ("guidance_scale", "max_plans")}
-        self._config.guidance_scale = guidance_scale
-        if guidance_scale == 0:
-            self._config.max_plans = 1  # the unguided policy
+        # Without guidance it is the plain policy, which executes the first plan that it draws.
+        max_plans = self._config.max_plans if guidance_scale else 1
         env_processors = make_env_pre_post_processors(self._env, self._config)
         env = self._make_env(n_episodes)
         pens: list[np.ndarray] = []
@@ -253,7 +262,11 @@ class GuidedPolicyFigures:
 
         try:
             # stderr gets LeRobot's progress bar.
-            with seeded_prior_noise(self._policy, 0), redirect_stderr(io.StringIO()):
+            with (
+                self._changed(guidance_scale=guidance_scale, max_plans=max_plans),
+                seeded_prior_noise(self._policy, 0),
+                redirect_stderr(io.StringIO()),
+            ):
                 result = rollout(
                     env,
                     self._policy,
@@ -266,8 +279,6 @@ class GuidedPolicyFigures:
                 )
         finally:
             env.close()
-            for name, value in configured.items():
-                setattr(self._config, name, value)
         observations = result["observation"]
         lengths = result["done"].int().argmax(dim=1) + 1
         # Joint positions cannot be drawn in a scene; positions of the pen can.
