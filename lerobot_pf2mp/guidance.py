@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from decimal import ROUND_FLOOR, Context
 
 import torch
 from torch import Tensor
@@ -151,14 +150,15 @@ class _OnDimensions:
 def _check_stability(scale: float, dt: float, bandwidth: float) -> None:
     if _is_stable(scale, dt, bandwidth):
         return
-    round_down = Context(prec=3, rounding=ROUND_FLOOR)
-    largest = round_down.create_decimal_from_float(2 * bandwidth**2 / dt)
-    if not _is_stable(float(largest), dt, bandwidth):  # the limit itself
-        largest = largest.next_minus(round_down)
+    limit = 2 * bandwidth**2 / dt
+    digit = 10.0 ** (math.floor(math.log10(limit)) - 2)  # the last of three
+    largest = math.floor(limit / digit) * digit
+    if not _is_stable(float(f"{largest:.3g}"), dt, bandwidth):  # the limit itself
+        largest -= digit
     raise ValueError(
         "guidance_integrator=euler diverges unless guidance_scale * dt / bandwidth^2 is below 2, got "
         f"{scale:g} * {dt:g} / {bandwidth:g}^2 = {scale * dt / bandwidth**2:g}: set guidance_scale to at most "
-        f"{float(largest):g}, or guidance_integrator=proximal, which is stable for every scale"
+        f"{largest:.3g}, or guidance_integrator=proximal, which is stable for every scale"
     )
 
 

@@ -560,7 +560,7 @@ def test_measuring_plans_changes_no_episode(
 def forgetful(checkpoint: str, folder: Path) -> str:
     """The same checkpoint with a field from before plans were calibrated."""
     policy, preprocessor, postprocessor = load_policy(checkpoint, device="cpu")
-    loaded_demonstrations(preprocessor).plans.forget()
+    loaded_demonstrations(preprocessor).calibration.plans.forget()
     for part in (policy, preprocessor, postprocessor):
         part.save_pretrained(folder)
     return str(folder)

@@ -128,7 +128,7 @@ def test_a_file_from_before_plans_were_counted_is_read_without_them(
 
 
 def test_published_rows_of_before_are_read_without_plans() -> None:
-    rows = read_rows(Path(__file__).parents[1] / "results/maze/summary.csv", SummaryRow)
+    rows = read_rows(Path(__file__).parents[1] / "results/ablations/maze_three_seeds/summary.csv", SummaryRow)
     assert rows and all(getattr(row, name) is None for row in rows for name in PLAN_COLUMNS[SummaryRow])
     assert "flagged" not in make_markdown(group_cells(rows))
 
