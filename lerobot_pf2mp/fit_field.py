@@ -268,7 +268,8 @@ def _observe_plans(
     ends = counts.cumsum(0)[number[chosen]] - 1
     starts = ends + 1 - counts[number[chosen]]
     rows = (chosen.unsqueeze(1) + delta).clamp(starts.unsqueeze(1), ends.unsqueeze(1))  # (E, T)
-    has_states = bool(places.numel())
+    state = dataset.meta.features.get(OBS_STATE, {})
+    has_states = bool(places.numel()) and tuple(state.get("shape", ())) == tuple(config.action_feature.shape)
     columns = [ACTION, *([OBS_STATE] if has_states else [])]
     table = dataset.hf_dataset.with_format("numpy", columns=columns)
     read = table[rows.flatten().tolist()]

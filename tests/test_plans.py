@@ -351,6 +351,12 @@ def test_a_robot_is_held_where_its_way_leaves_the_region(planned: str, executed:
     assert reaction("ignore", planned) == [planned]
 
 
+def test_a_robot_that_moves_meanwhile_is_not_sent_back() -> None:
+    chunk = plans_of("1x345x")
+    _, plans = choose_plans(CHECK, at_home(1), chunk, 1, None)
+    assert marks_of(react("hold", plans, chunk, at_home(1), n_committed=3)) == ["1x3455"]
+
+
 def test_robots_side_by_side_are_held_each_for_itself() -> None:
     places = at_home(3)
     places[:, 0] += torch.tensor([0.07, 0.08, 0.09])

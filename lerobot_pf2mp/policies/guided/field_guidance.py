@@ -243,7 +243,7 @@ class FieldGuidance:
             chunk, self.plans = choose_plans(
                 check, places, chunk, config.max_plans, draw if has_time else None
             )
-            chunk = react(config.on_unsupported, self.plans, chunk, places)
+            chunk = react(config.on_unsupported, self.plans, chunk, places, self._n_steps or 0)
             self._last = chunk, places
         self._executed = self._n_executed = self._n_steps = None
         return chunk

@@ -100,7 +100,7 @@ def choose_plans(
     return chunk, Plans(n_drawn, smallest < 0, smallest, support)
 
 
-def react(on_unsupported: str, plans: Plans, chunk: Tensor, places: Tensor) -> Tensor:
+def react(on_unsupported: str, plans: Plans, chunk: Tensor, places: Tensor, n_committed: int = 0) -> Tensor:
     """The actions to execute of chosen plans, some of which may still leave the demonstrated region.
 
     Args:
@@ -109,6 +109,7 @@ def react(on_unsupported: str, plans: Plans, chunk: Tensor, places: Tensor) -> T
         plans: The plans.
         chunk: ``(B, T, A)`` their actions [normalised].
         places: ``(B, A)`` where the robots are [normalised].
+        n_committed: Number of first actions that pass, as continuations of the last plan, until this one is there.
 
     Raises:
         UnsupportedPlanError: With stop, if a plan leaves the region.
@@ -124,12 +125,17 @@ def react(on_unsupported: str, plans: Plans, chunk: Tensor, places: Tensor) -> T
     if on_unsupported == "stop":
         raise UnsupportedPlanError(f"{message}; nothing of it is executed (on_unsupported=stop)")
     logger.warning(message)
-    return chunk if on_unsupported == "warn" else hold(chunk, places, plans.action_support)
+    return chunk if on_unsupported == "warn" else hold(chunk, places, plans.action_support, n_committed)
 
 
-def hold(chunk: Tensor, places: Tensor, action_support: Tensor) -> Tensor:
-    """Chunks ``(B, T, A)`` up to the first action with negative support; then the action before it, or the place."""
-    is_followed = (action_support >= 0).cumprod(dim=1).bool()  # (B, T)
+def hold(chunk: Tensor, places: Tensor, action_support: Tensor, n_committed: int = 0) -> Tensor:
+    """Chunks ``(B, T, A)`` up to the first action with negative support; then the action before it, or the place.
+
+    The first `n_committed` actions are kept: the robot has passed them when the chunk is there, and must not go back.
+    """
+    is_supported = action_support >= 0
+    is_supported[:, :n_committed] = True
+    is_followed = is_supported.cumprod(dim=1).bool()  # (B, T)
     last = is_followed.sum(dim=1)  # 0: none
     stops = torch.cat([places.unsqueeze(1).to(chunk), chunk], dim=1)[
         torch.arange(len(chunk), device=chunk.device), last
