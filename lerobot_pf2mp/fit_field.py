@@ -260,6 +260,7 @@ def _observe_plans(
     )
     n_actions = len(delta) + int(delta[0])  # from the current step on
     n_dropped = min(cast(Any, config).drop_n_last_frames, n_actions - 1)
+    n_dropped = max(n_dropped, cast(Any, config).n_action_steps - 1)  # as `DemonstratedActions.observe`
     chosen = choose_plans_of_episodes(episodes, frames, n_dropped)
     if not len(chosen):
         return

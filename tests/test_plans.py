@@ -564,14 +564,18 @@ def test_a_caller_that_plans_early_is_held_where_the_robot_is_seen() -> None:
         assert torch.equal(held, torch.full_like(held, state))
 
 
-def test_without_a_state_the_way_begins_at_the_first_action() -> None:
+def test_without_a_state_the_way_begins_at_the_first_action_which_must_be_supported_to_hold() -> None:
     policy = policy_of("pf2mp", max_plans=1, on_unsupported="hold", guidance_scale=0.0)
     noise = torch.randn(1, HORIZON, 2, generator=torch.Generator().manual_seed(1))
     batch = batch_for(policy, states=None, places=None)
-    held = policy.predict_action_chunk(batch, noise=noise)
-    policy.config.on_unsupported = "ignore"
-    first = policy.predict_action_chunk(batch, noise=noise)[:, :1]
-    assert torch.equal(held, first.expand_as(held))
+    with pytest.raises(UnsupportedPlanError, match="already the first action does. Where the robot is"):
+        policy.predict_action_chunk(batch, noise=noise)
+
+
+def test_a_robot_whose_place_is_unknown_is_held_at_its_last_supported_action() -> None:
+    chunk = plans_of("12x4", "1234")
+    _, plans = choose_plans(CHECK, chunk[:, 0], chunk, 1, None)
+    assert marks_of(react("hold", plans, chunk, None)) == ["1222", "1234"]
 
 
 def test_a_state_in_other_units_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
@@ -580,7 +584,7 @@ def test_a_state_in_other_units_is_said_once(caplog: pytest.LogCaptureFixture) -
     with caplog.at_level(logging.WARNING):
         for _ in range(3):
             policy.predict_action_chunk(batch)
-    assert sum("observation.state is not in the units of action" in r.message for r in caplog.records) == 1
+    assert sum("or is not in its units" in r.message for r in caplog.records) == 1
 
 
 @pytest.mark.parametrize("kind", ["pf2mp", "dppf"])

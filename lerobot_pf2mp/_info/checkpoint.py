@@ -20,7 +20,15 @@ def checkpoint_lines(path: str) -> Iterator[Line]:
     Args:
         path: Its ``pretrained_model`` folder, or a repository on the Hub.
     """
+    level = logging.root.manager.disable
     logging.disable(logging.WARNING)  # each finding is a line of the report
+    try:
+        yield from _lines(path)
+    finally:
+        logging.disable(level)
+
+
+def _lines(path: str) -> Iterator[Line]:
     try:
         from lerobot_pf2mp import load_policy
 

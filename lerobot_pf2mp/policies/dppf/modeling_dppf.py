@@ -71,7 +71,8 @@ class DPPFPolicy(WithoutPEFT, WithModelCard, DiffusionPolicy):
                 dimensions, or one without demonstrated plans; or if an action is not finite.
             UnsupportedPlanError: With ``on_unsupported=stop``, if no plan stays in the demonstrated region.
         """
-        guide = guide or self.guidance.begin(batch, next(self.parameters()).device)
+        self.guidance.begin()
+        guide = guide or self.guidance.guide(batch, next(self.parameters()).device)
         window = self._with_window(batch)
         with self._guided(guide):
             chunk = super().predict_action_chunk(window, noise=noise)

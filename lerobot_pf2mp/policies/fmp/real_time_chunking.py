@@ -45,6 +45,8 @@ def n_executed_of(chunk: Tensor, left_over: Tensor) -> int | None:
     Returns:
         The number, T if nothing is left; None if the left-over is of another chunk.
     """
+    if left_over.ndim == 3 and len(left_over) not in (1, len(chunk)):
+        return None
     left_over = left_over.expand(len(chunk), *left_over.shape[-2:]).to(chunk)
     n_left = int(is_committed(left_over).sum(dim=-1).amin())
     if n_left == 0:

@@ -27,7 +27,7 @@ class GuidedConfig:
     needs a new training.
 
     Args:
-        guidance_scale: lambda, the strength of the guidance; 0 is exactly the unguided policy.
+        guidance_scale: lambda, the strength of the guidance; 0 with max_plans=1 is exactly the unguided policy.
         guidance_integrator: proximal (solved exactly over a step, insensitive to lambda) or euler (Algorithm 2 as printed).
         guidance_point: The point at which each step evaluates the field: current (A_t), end (the end point that the step
             predicts) or next (after the step). None is the integrator's own: current for euler, end for proximal.

@@ -144,7 +144,10 @@ class DemonstratedActions:
             is_plan: Tensor | slice = slice(None)
             if is_pad is not None:
                 n_left = (~is_pad[:, n_past:]).sum(dim=1)  # in the episode
-                is_plan = n_left > min(drop_n_last_frames, actions.shape[1] - n_past - 1)
+                n_dropped = min(drop_n_last_frames, actions.shape[1] - n_past - 1)
+                is_plan = n_left > max(
+                    n_dropped, n_executed - 1
+                )  # copies at its end would support a plan better
             self.observe_plans(
                 actions[is_plan, n_past:],
                 (frames + n_past)[is_plan],
@@ -273,7 +276,8 @@ class DemonstratedActions:
         )
 
     def _score_plans(self, settings: FieldSettings, n_actions: int) -> Tensor:
-        field = self.field(settings)
+        # On the device on which it is used, so that it need not be prepared again.
+        field = self.field(settings, "cpu" if self._fitted is None else self._fitted[1].anchors.device)
         is_anchor = ~self._is_outlying
         episodes = self.episodes if settings.leave_out == "episode" else None
         return self.calibration.plans.scores(
@@ -383,7 +387,7 @@ class DemonstratedActions:
         if not len(self):
             raise ValueError(
                 "the potential field is not fitted: it has seen no demonstrations. Train the policy, load a checkpoint "
-                "whose preprocessor holds the field, or set guidance_scale=0"
+                "whose preprocessor holds the field, or set guidance_scale=0, max_plans=1 and on_unsupported=ignore"
             )
         if settings.action_dims != self.settings.action_dims:
             raise ValueError(

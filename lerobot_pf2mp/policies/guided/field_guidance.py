@@ -166,24 +166,13 @@ class FieldGuidance:
         self._executed = action
 
     @torch.compiler.disable
-    def begin(
-        self,
-        batch: dict[str, Any],
-        device: torch.device,
-        left_over: Tensor | None = None,
-        inference_delay: int = 0,
-    ) -> Guide | None:
-        """A call begins: `guide`, and the time that the call takes counts from here.
+    def begin(self, left_over: Tensor | None = None, inference_delay: int = 0) -> None:
+        """A call begins, and the time that it takes counts from here.
 
         Args:
-            batch: As for `guide`.
-            device: As there.
             left_over: ``([B,] T_left, A)`` actions of the last chunk that were not executed; None if no robot is moving on
                 them.
             inference_delay: Number of those that are executed until the chunk is needed.
-
-        Raises:
-            ValueError: As there.
         """
         self._n_executed = self._n_steps = None
         if left_over is not None:
@@ -192,7 +181,6 @@ class FieldGuidance:
             if bool(is_committed(left_over).any()):  # otherwise the robot waits
                 self._n_steps = inference_delay
         self._budget.begin(self._n_executed)
-        return self.guide(batch, device)
 
     def choose(
         self,
@@ -214,7 +202,8 @@ class FieldGuidance:
         """
         config = self.config
         is_checked = config.checks_plans or self.measures_plans
-        if torch.compiler.is_compiling() and POTENTIAL_FIELD not in batch:
+        is_asked_for = config.on_unsupported != "ignore" or self.measures_plans
+        if torch.compiler.is_compiling() and POTENTIAL_FIELD not in batch and not is_asked_for:
             return require_finite(chunk, batch)  # one graph, for a guide that the caller made
         return self._choose(batch, chunk, draw_more, is_checked)
 
@@ -231,19 +220,16 @@ class FieldGuidance:
         check = self._plan_check(batch, chunk) if is_checked else None
         if check is not None:
             config = self.config
-            places = self._places_of_robots(batch, chunk)
-
-            def draw(rows: Tensor, n: int) -> Tensor:
-                began = time.perf_counter()
-                more = draw_more(rows, n)
-                self._budget.took(time.perf_counter() - began)
-                return more
-
-            has_time = self._budget.allows_another_pass(self._n_steps)
+            known = self._places_of_robots(batch, chunk)
+            places = chunk[:, 0] if known is None else known
+            has_time = self._budget.allows_another_pass(self._n_steps, config.max_plans - 1)
+            began = time.perf_counter()
             chunk, self.plans = choose_plans(
-                check, places, chunk, config.max_plans, draw if has_time else None
+                check, places, chunk, config.max_plans, draw_more if has_time else None
             )
-            chunk = react(config.on_unsupported, self.plans, chunk, places, self._n_steps or 0)
+            if bool((self.plans.n_drawn > 1).any()):
+                self._budget.took(time.perf_counter() - began)
+            chunk = react(config.on_unsupported, self.plans, chunk, known, self._n_steps or 0)
             self._last = chunk, places
         self._executed = self._n_executed = self._n_steps = None
         return chunk
@@ -262,6 +248,14 @@ class FieldGuidance:
                 raise
             self._warn_once("Plans are not checked, and none is drawn again: %s", error)
             return None
+        if threshold.false_alarm_rate > config.false_alarm_rate:
+            self._warn_once(
+                "false_alarm_rate=%g cannot be kept with %d demonstrated plans: up to %.2g %% of plans as good as a "
+                "demonstration are flagged.",
+                config.false_alarm_rate,
+                threshold.n_plans,
+                100 * threshold.false_alarm_rate,
+            )
         return PlanCheck(field, threshold.log_density, config.field_settings.action_dims)
 
     def _warn_once(self, message: str, *arguments: object) -> None:
@@ -269,12 +263,12 @@ class FieldGuidance:
             self._said.add(message)
             logger.warning(message, *arguments)
 
-    def _places_of_robots(self, batch: dict[str, Any], chunk: Tensor) -> Tensor:
-        """Where the robots are when they begin to execute a chunk, as actions ``(B, A)`` [normalised].
+    def _places_of_robots(self, batch: dict[str, Any], chunk: Tensor) -> Tensor | None:
+        """Where the robots are when they begin to execute a chunk, as actions ``(B, A)`` [normalised]; None if unknown.
 
         It is the last action that was executed. Where that is unknown, as in the first chunk, it is the observed state, and
-        the chunk's first action in dimensions that the field does not cover. Without a state in the units of the actions it
-        is the chunk's first action.
+        the chunk's first action in dimensions that the field does not cover. It is unknown without a state in the units of
+        the actions.
         """
         n_robots = len(chunk)
         if self._executed is not None:
@@ -290,18 +284,17 @@ class FieldGuidance:
         demonstrations, states = batch.get(POTENTIAL_FIELD), batch.get(OBS_STATE)
         first = chunk[:, 0]
         if not isinstance(demonstrations, DemonstratedActions) or states is None:
-            return first
+            return None
         states = states[:, -1] if states.ndim == 3 else states
         calibration = demonstrations.calibration
         if not calibration.starts_at_state or states.shape != first.shape:
-            if calibration.places.numel():
-                self._warn_once(
-                    "%s is not in the units of %s: the way of a first plan begins at its first action, not where the robot "
-                    "is seen.",
-                    OBS_STATE,
-                    ACTION,
-                )
-            return first
+            self._warn_once(
+                "%s has other dimensions than %s, or is not in its units: the way of a first plan begins at its first "
+                "action, not where the robot is seen.",
+                OBS_STATE,
+                ACTION,
+            )
+            return None
         place = demonstrations.place_of(states.to(first))
         dims = self.config.field_settings.action_dims
         return place if dims is None else first.index_copy(1, torch.tensor(dims, device=first.device), place)
@@ -323,7 +316,8 @@ def fitted_field(
     if not isinstance(demonstrations, DemonstratedActions):
         raise ValueError(
             f"guidance needs the potential field, which the policy's own preprocessor puts under {POTENTIAL_FIELD!r}; "
-            "got a batch without it. Load the preprocessor from the checkpoint, or set guidance_scale=0"
+            "got a batch without it. Load the preprocessor from the checkpoint, or set guidance_scale=0, max_plans=1 and "
+            "on_unsupported=ignore"
         )
     field = demonstrations.field(config.field_settings, device)
     dims = config.field_action_dims

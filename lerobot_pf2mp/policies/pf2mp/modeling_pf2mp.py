@@ -75,12 +75,9 @@ class PF2MPPolicy(FMPPolicy):
                 dimensions, or one without demonstrated plans; or if an action is not finite.
             UnsupportedPlanError: With ``on_unsupported=stop``, if no plan stays in the demonstrated region.
         """
-        guide = guide or self.guidance.begin(
-            batch,
-            next(self.parameters()).device,
-            options.get("prev_chunk_left_over"),
-            options.get("inference_delay", 0),
-        )
+        if guide is None or not torch.compiler.is_compiling():  # with a guide, a compiled plan is one graph
+            self.guidance.begin(options.get("prev_chunk_left_over"), options.get("inference_delay", 0))
+        guide = guide or self.guidance.guide(batch, next(self.parameters()).device)
         draw = self._drawing(batch, guide, **options)
         return self.guidance.choose(
             batch,

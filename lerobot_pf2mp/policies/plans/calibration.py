@@ -95,7 +95,12 @@ class PlanCalibration:
         asked = density, n_actions, false_alarm_rate
         if self._threshold is not None and self._threshold[0] == asked:
             return self._threshold[1]  # as in nearly every call of a policy
-        if not (len(self.plans) and can_judge):
+        if not can_judge:
+            raise ValueError(
+                "the check of plans needs the episodes of a field's actions, got a potential field that does not know all "
+                f"of them: {_REMEDY}"
+            )
+        if not len(self.plans):
             raise ValueError(
                 f"the check of plans needs demonstrated plans, got a potential field without them: {_REMEDY}"
             )

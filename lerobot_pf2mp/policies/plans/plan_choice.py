@@ -100,7 +100,9 @@ def choose_plans(
     return chunk, Plans(n_drawn, smallest < 0, smallest, support)
 
 
-def react(on_unsupported: str, plans: Plans, chunk: Tensor, places: Tensor, n_committed: int = 0) -> Tensor:
+def react(
+    on_unsupported: str, plans: Plans, chunk: Tensor, places: Tensor | None, n_committed: int = 0
+) -> Tensor:
     """The actions to execute of chosen plans, some of which may still leave the demonstrated region.
 
     Args:
@@ -108,11 +110,12 @@ def react(on_unsupported: str, plans: Plans, chunk: Tensor, places: Tensor, n_co
             unsupported, repeats the action before it: where the robot is, if that is the first one); or stop.
         plans: The plans.
         chunk: ``(B, T, A)`` their actions [normalised].
-        places: ``(B, A)`` where the robots are [normalised].
+        places: ``(B, A)`` where the robots are [normalised]; None if that is unknown.
         n_committed: Number of first actions that pass, as continuations of the last plan, until this one is there.
 
     Raises:
-        UnsupportedPlanError: With stop, if a plan leaves the region.
+        UnsupportedPlanError: With stop, if a plan leaves the region; with hold, if already the first action does, and it is
+            unknown where the robot is.
     """
     if on_unsupported == "ignore" or not bool(plans.is_flagged.any()):
         return chunk
@@ -124,6 +127,12 @@ def react(on_unsupported: str, plans: Plans, chunk: Tensor, places: Tensor, n_co
     )
     if on_unsupported == "stop":
         raise UnsupportedPlanError(f"{message}; nothing of it is executed (on_unsupported=stop)")
+    if places is None:
+        if on_unsupported == "hold" and n_committed == 0 and bool((plans.action_support[:, 0] < 0).any()):
+            raise UnsupportedPlanError(
+                f"{message}, and already the first action does. Where the robot is, which hold needs, is not known"
+            )
+        places = chunk[:, 0]
     logger.warning(message)
     return chunk if on_unsupported == "warn" else hold(chunk, places, plans.action_support, n_committed)
 
@@ -162,14 +171,18 @@ class LatencyBudget:
             self._step = (now - self._began) / n_executed
         self._began = now
 
-    def allows_another_pass(self, n_steps: int | None) -> bool:
-        """Whether another pass ends within `n_steps` steps since the call began; None: the robot waits for the plan."""
+    def allows_another_pass(self, n_steps: int | None, n_plans: int = 1) -> bool:
+        """Whether another pass, for `n_plans` plans, ends within `n_steps` steps since the call began.
+
+        With `n_steps` None the robot waits for the plan. Until a pass has been timed, it is expected to take as long for
+        each of its plans as the first plan took.
+        """
         if n_steps is None or self._began is None:
             return True
         if self._step is None:
             return False
         elapsed = time.perf_counter() - self._began
-        expected = elapsed if self._pass is None else self._pass
+        expected = n_plans * elapsed if self._pass is None else self._pass
         return elapsed + expected <= n_steps * self._step
 
     def took(self, seconds: float) -> None:
