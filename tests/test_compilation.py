@@ -121,7 +121,7 @@ def test_the_steps_of_a_guided_policy_are_one_graph(sums: str) -> None:
 
 @pytest.mark.slow
 def test_a_compiled_policy_watches_its_plans() -> None:
-    policy = policy_of("pf2mp", on_unsupported="hold", guidance_scale=0.0)
+    policy = policy_of("pf2mp", on_unsupported="warn", guidance_scale=0.0)
     (batch,), (noise,) = batches_for(policy, 1), noises(1)
     torch.manual_seed(2)
     chunk = torch.compile(policy.predict_action_chunk, backend="eager")(dict(batch), noise=3 * noise)

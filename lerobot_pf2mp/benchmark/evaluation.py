@@ -74,7 +74,7 @@ class _Evaluator:
         measures_plans = False
         if isinstance(policy.config, GuidedConfig):
             self._set_options(policy.config, job, max_plans)
-            measures_plans = _can_check_plans(policy.config, preprocessor)
+            measures_plans = _can_check_plans(policy.config, preprocessor, max_plans)
         env_preprocessor, env_postprocessor = make_env_pre_post_processors(env_config, policy.config)
         latency = _measure_latency(env, policy, env_preprocessor, preprocessor, spec.episode_seed)
         env.watch(policy)
@@ -158,7 +158,7 @@ def _work(job: Job) -> list[EpisodeRow]:
     return _worker(job)
 
 
-def _can_check_plans(config: Any, preprocessor: Any) -> bool:
+def _can_check_plans(config: Any, preprocessor: Any, max_plans: int) -> bool:
     """Whether a guided policy has what its plans are checked with.
 
     Raises:
@@ -172,7 +172,7 @@ def _can_check_plans(config: Any, preprocessor: Any) -> bool:
             config.field_settings, config.n_action_steps, config.false_alarm_rate
         )
     except ValueError:
-        if config.max_plans > 1:
+        if max_plans > 1:
             raise
         return False
     return True
