@@ -27,7 +27,8 @@ from safetensors.torch import load_file, save_file
 
 from lerobot_pf2mp import PF2MPMazeEnv, load_policy
 from lerobot_pf2mp.commands import cli
-from lerobot_pf2mp.hub.model_card import CardFacts, PolicyFacts, env_options, make_model_card
+from lerobot_pf2mp.hub.card_facts import CardFacts, PolicyFacts
+from lerobot_pf2mp.hub.model_card import env_options, make_model_card
 
 BIN = Path(sys.executable).parent
 SECONDS = 600  # for a command, on a machine that is busy with other things

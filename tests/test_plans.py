@@ -244,11 +244,11 @@ def test_states_in_other_units_are_not_where_the_robot_is() -> None:
     places = torch.stack([torch.ones(2), torch.zeros(2)])
     chunks = episodes.unfold(1, HORIZON, 1).transpose(2, 3)
     states = chunks[:, :, 0].reshape(-1, 2)
-    assert demonstrated(episodes, states=states, places=places).calibration.starts_at_state
+    assert demonstrated(episodes, states=states, places=places).calibration.starts_at_state(None)
     in_degrees = torch.stack([torch.full((2,), 57.3), torch.zeros(2)])
-    assert not demonstrated(episodes, states=states, places=in_degrees).calibration.starts_at_state
-    assert not demonstrated(episodes, states=-states, places=places).calibration.starts_at_state
-    assert not demonstrated(episodes).calibration.starts_at_state
+    assert not demonstrated(episodes, states=states, places=in_degrees).calibration.starts_at_state(None)
+    assert not demonstrated(episodes, states=-states, places=places).calibration.starts_at_state(None)
+    assert not demonstrated(episodes).calibration.starts_at_state(None)
 
 
 # The choice among plans.

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import sys
 from collections.abc import Iterator
 from contextlib import redirect_stdout
@@ -61,7 +60,7 @@ def _field_lines(config: Any, preprocessor: Any) -> Iterator[Line]:
         f"{len(field.anchors)} anchors{from_episodes} in {field.dim} dimensions, h = {field.bandwidth:.4g}, safe set: "
         f"log density above {field.log_threshold:.4g}",
     )
-    region = config.guidance_region if math.isfinite(field.log_no_pull) else "everywhere"
+    region = demonstrations.region(config.field_settings)
     where = region if region == "everywhere" else f"{region}, quantile {config.guidance_quantile:g}"
     yield Line("guidance", f"{config.guidance_integrator}, lambda = {config.guidance_scale:g}, {where}")
     try:
@@ -82,7 +81,7 @@ def _field_lines(config: Any, preprocessor: Any) -> Iterator[Line]:
     )
     place = (
         "the observed state"
-        if demonstrations.calibration.starts_at_state
+        if demonstrations.starts_at_state(config.field_settings)
         else ("the first action, as the observed state is not in the units of the actions")
     )
     yield Line("way of a plan", f"begins at the last executed action; in the first plan at {place}")

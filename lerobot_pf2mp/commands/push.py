@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from lerobot_pf2mp.commands.command import given
 
 if TYPE_CHECKING:
-    from lerobot_pf2mp.hub.model_card import PolicyFacts
+    from lerobot_pf2mp.hub.card_facts import PolicyFacts
 
 
 @dataclass
@@ -67,7 +67,7 @@ def _loaded_facts(path: Path) -> PolicyFacts:
         ValueError: If the checkpoint is damaged, or its policy is not of this package.
         OSError: If it cannot be read.
     """
-    from lerobot_pf2mp.hub.model_card import POLICY_NAMES
+    from lerobot_pf2mp.hub.card_facts import POLICY_NAMES
     from lerobot_pf2mp.loading import load_config, load_policy, loaded_demonstrations, loaded_field
     from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
     from lerobot_pf2mp.policies.model_card import policy_facts

@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import PurePosixPath
 from typing import Any
@@ -14,15 +13,12 @@ from typing import Any
 import draccus
 from huggingface_hub import ModelCard, ModelCardData
 
+from lerobot_pf2mp.hub.card_facts import POLICY_NAMES, CardFacts, GuidanceFacts
+
 INSTALL = "pip install lerobot_policy_pf2mp"
 DEFAULT_LICENSE = "apache-2.0"
 
 _TAGS = {"fmp": ["flow-matching"], "pf2mp": ["flow-matching"], "dppf": ["diffusion"]}
-POLICY_NAMES = {
-    "fmp": "Flow Matching Policy (FMP)",
-    "pf2mp": "Potential Field-Guided Flow Matching Policy (PF2MP)",
-    "dppf": "Diffusion Policy with Potential Field Guidance (DPPF)",
-}
 _GENERATES = {
     "fmp": "It turns noise into a chunk of actions by integrating a learned velocity field.",
     "pf2mp": "It turns noise into a chunk of actions by integrating a learned velocity field.",
@@ -31,10 +27,13 @@ _GENERATES = {
 _GUIDED = (
     "While it does so, a potential field, fitted to the demonstrated actions alone, steers every action back to where the "
     "demonstrations went, and so away from obstacles that nobody has modelled. The field is part of this repository and "
-    "comes with the preprocessor; `--policy.guidance_scale=0` turns it off. Every plan is checked with it before it is "
-    "executed, and drawn again if it leaves the demonstrated region. The method is *Towards Safe Imitation Learning "
-    "via Potential Field-Guided Flow Matching* (Ding et al., IROS 2025, [arXiv:2508.08707]"
-    "(https://arxiv.org/abs/2508.08707))."
+    "comes with the preprocessor; `--policy.guidance_scale=0` turns it off."
+)
+_CHECKED = "Every plan is checked with it before it is executed"
+_DRAWN_AGAIN = ", and drawn again if it leaves the demonstrated region"
+_METHOD = (
+    "The method is *Towards Safe Imitation Learning via Potential Field-Guided Flow Matching* (Ding et al., IROS 2025, "
+    "[arXiv:2508.08707](https://arxiv.org/abs/2508.08707))."
 )
 _LIMITS = (
     "Obstacles must be where they were in the demonstrations, and demonstrations must cover the free space that is needed: "
@@ -46,114 +45,11 @@ _LIMITS = (
 _UNGUIDED_LIMITS = ("It imitates the demonstrations and knows nothing of obstacles or of limits of a robot.",)
 
 
-@dataclass(frozen=True)
-class PlanFacts:
-    """The facts about the check of plans.
-
-    Args:
-        log_threshold: Smallest log density that the way of a plan may have [nats].
-        false_alarm_rate: Largest probability with which a plan as good as a fresh demonstration is flagged.
-        n_plans: Number of demonstrated plans from which that follows.
-    """
-
-    log_threshold: float
-    false_alarm_rate: float
-    n_plans: int
-
-
-@dataclass(frozen=True)
-class GuidanceFacts:
-    """The facts about a policy's guidance for its card.
-
-    Args:
-        scale: lambda.
-        integrator: proximal or euler.
-        point: The point at which the field is evaluated; None for the integrator's own.
-        action_dims: The action dimensions that the field covers.
-        alpha: Weight of the distance term [1/normalised].
-        bandwidth_rule: The rule by which the bandwidth was chosen; None for a given number.
-        bandwidth: The bandwidth h [normalised action units]; None if the field is not fitted.
-        n_anchors: The number M of anchors; None if the field is not fitted.
-        region: Where the field pulls: everywhere, unsupported or fading.
-        quantile: The quantile of demonstrated actions' densities above which it does not; of no meaning for everywhere.
-        max_plans: Largest number of plans that are drawn for one that is executed.
-        on_unsupported: What happens if the best of them leaves the demonstrated region.
-        plans: How plans are calibrated; None if they are not.
-    """
-
-    scale: float
-    integrator: str
-    point: str | None
-    action_dims: Sequence[int]
-    alpha: float
-    bandwidth_rule: str | None
-    bandwidth: float | None = None
-    n_anchors: int | None = None
-    region: str = "everywhere"
-    quantile: float = 0.5
-    max_plans: int = 1
-    on_unsupported: str = "ignore"
-    plans: PlanFacts | None = None
-
-
-@dataclass(frozen=True)
-class PolicyFacts:
-    """The facts about a policy for its card.
-
-    Args:
-        type: Its registered name, one of `POLICY_NAMES`.
-        inputs: Shapes of the input features by name.
-        outputs: Shapes of the output features by name.
-        horizon: Actions predicted at once.
-        n_action_steps: Number of these actions that are executed.
-        num_inference_steps: Integration or denoising steps N.
-        guidance: Its guidance; None for an unguided policy.
-        license: Name of the licence; None for the default.
-        tags: More tags.
-    """
-
-    type: str
-    inputs: Mapping[str, Sequence[int]]
-    outputs: Mapping[str, Sequence[int]]
-    horizon: int
-    n_action_steps: int
-    num_inference_steps: int
-    guidance: GuidanceFacts | None = None
-    license: str | None = None
-    tags: Sequence[str] = ()
-
-
-@dataclass(frozen=True)
-class CardFacts:
-    """All facts that a card is written from.
-
-    Args:
-        policy: The policy.
-        repo_id: The repository in which it is published, ``user/name``.
-        dataset: Name of the dataset it was trained on; None if unknown.
-        dataset_size: Its number of episodes and of frames; None if unknown.
-        training: LeRobot's training configuration, as in ``train_config.json``; empty if unknown.
-        env_options: Options of lerobot-eval for the environment, as `env_options` gives them; empty if unknown.
-        table: A table of results in Markdown; None without one.
-        made_with: Versions and hardware of the results.
-        figures: Images and videos, by their paths in the repository.
-    """
-
-    policy: PolicyFacts
-    repo_id: str
-    dataset: str | None = None
-    dataset_size: tuple[int, int] | None = None
-    training: Mapping[str, Any] = field(default_factory=dict)
-    env_options: Sequence[str] = ()
-    table: str | None = None
-    made_with: Mapping[str, str] = field(default_factory=dict)
-    figures: Sequence[str] = ()
-
-
 def make_model_card(facts: CardFacts) -> ModelCard:
     """The card of a policy of this package."""
     kind, license = facts.policy.type, facts.policy.license or DEFAULT_LICENSE
-    is_guided = facts.policy.guidance is not None
+    guidance = facts.policy.guidance
+    is_guided = guidance is not None
     tags = ["lerobot", "pf2mp", *_TAGS[kind], "robotics", kind, *facts.policy.tags]
     metadata = ModelCardData(
         library_name="lerobot",
@@ -165,7 +61,7 @@ def make_model_card(facts: CardFacts) -> ModelCard:
     sections = [
         f"# {facts.repo_id}",
         f"A {POLICY_NAMES[kind]} for [LeRobot](https://github.com/huggingface/lerobot). {_GENERATES[kind]}"
-        + (f" {_GUIDED}" if is_guided else ""),
+        + ("" if guidance is None else f" {_introduce(guidance)}"),
         "## Use",
         _usage(facts),
         "## Details",
@@ -204,6 +100,13 @@ def env_options(env: Mapping[str, Any] | None) -> list[str]:
 def _is_on_the_hub(dataset: str | None) -> bool:
     """Whether a dataset's name can be a name on the Hub. By default, this package's commands use names local/... ."""
     return bool(dataset and dataset.count("/") == 1 and not dataset.startswith("local/"))
+
+
+def _introduce(guidance: GuidanceFacts) -> str:
+    sentences = [_GUIDED, _METHOD]
+    if guidance.plans is not None:
+        sentences.insert(1, f"{_CHECKED}{_DRAWN_AGAIN if guidance.max_plans > 1 else ''}.")
+    return " ".join(sentences)
 
 
 def _usage(facts: CardFacts) -> str:

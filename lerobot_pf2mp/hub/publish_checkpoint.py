@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lerobot_pf2mp.hub.model_card import CardFacts, PolicyFacts, env_options, make_model_card
+from lerobot_pf2mp.hub.card_facts import CardFacts, PolicyFacts
+from lerobot_pf2mp.hub.model_card import env_options, make_model_card
 from lerobot_pf2mp.hub.publishing import check_destination, publish
 from lerobot_pf2mp.results.rows import SummaryRow, read_rows
 

@@ -9,14 +9,8 @@ from typing import Any
 
 from huggingface_hub import ModelCard
 
-from lerobot_pf2mp.hub.model_card import (
-    CardFacts,
-    GuidanceFacts,
-    PlanFacts,
-    PolicyFacts,
-    env_options,
-    make_model_card,
-)
+from lerobot_pf2mp.hub.card_facts import CardFacts, GuidanceFacts, PlanFacts, PolicyFacts
+from lerobot_pf2mp.hub.model_card import env_options, make_model_card
 from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
 from lerobot_pf2mp.policies.guided.field_guidance import FieldGuidance
@@ -94,10 +88,11 @@ def policy_facts(
 def _guidance_facts(
     config: Any, demonstrations: DemonstratedActions | None, action_dim: int
 ) -> GuidanceFacts:
-    field, plans = None, None
+    field, plans, region = None, None, config.guidance_region
     if demonstrations is not None:
         with suppress(ValueError):  # not fitted, for example after a training of 0 steps
             field = demonstrations.field(config.field_settings)
+            region = demonstrations.region(config.field_settings)
     if demonstrations is not None and field is not None and config.checks_plans:
         with suppress(ValueError):  # a field of before has no demonstrated plans
             threshold = demonstrations.plan_threshold(
@@ -113,7 +108,7 @@ def _guidance_facts(
         bandwidth_rule=config.field_bandwidth if isinstance(config.field_bandwidth, str) else None,
         bandwidth=None if field is None else field.bandwidth,
         n_anchors=None if field is None else len(field.anchors),
-        region=config.guidance_region,
+        region=region,
         quantile=config.guidance_quantile,
         max_plans=config.max_plans,
         on_unsupported=config.on_unsupported,

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from lerobot_pf2mp.density.kernels import wrap
 
-# A piece of a way is judged at this many points at most. One that is longer than as many bandwidths leads far away from
-# the anchors at its end, or between its ends, wherever it is looked at.
-_MOST_POINTS = 64
+# A piece of a way is judged at this many points at most, so that a wild plan costs bounded time and memory. At a bandwidth
+# of 1 % of a dimension's range, that is a piece across the whole range. On a longer one, points are farther apart than h.
+_MOST_POINTS = 128
 
 
 def way_log_density(

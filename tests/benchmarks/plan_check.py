@@ -79,7 +79,7 @@ def measure(checkpoint: Path, data: Path) -> dict[str, Any]:
     states, chunks = plans_of(data, n_actions, preprocessor.steps)
     dims = settings.action_dims
     covered = chunks if dims is None else chunks[..., list(dims)]
-    places = demonstrations.place_of(states) if demonstrations.calibration.starts_at_state else covered[:, 0]
+    places = demonstrations.place_of(states) if demonstrations.starts_at_state(settings) else covered[:, 0]
     flagged = {}
     for rate in RATES:
         threshold = demonstrations.plan_threshold(settings, n_actions, rate)
@@ -101,7 +101,7 @@ def measure(checkpoint: Path, data: Path) -> dict[str, Any]:
             config.num_inference_steps,
             guide=guide,
         )
-        distance = ((ends - covered) / demonstrations._unit).norm(dim=-1)
+        distance = ((ends - covered) / demonstrations._angles.unit).norm(dim=-1)
         moved[f"{region} {quantile:g}" if region != "everywhere" else region] = {
             "mean": distance.mean().item(),
             "last": distance[:, -1].mean().item(),

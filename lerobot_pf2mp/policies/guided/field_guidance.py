@@ -20,12 +20,12 @@ from torch import Tensor
 from lerobot_pf2mp.flow_matching import Guide
 from lerobot_pf2mp.guidance import GuidanceSettings, make_guide
 from lerobot_pf2mp.policies.batch_keys import ACTION_IS_PAD, POTENTIAL_FIELD
-from lerobot_pf2mp.policies.fmp.real_time_chunking import is_committed, n_executed_of
 from lerobot_pf2mp.policies.guided.action_kind import warn_unless_positions
 from lerobot_pf2mp.policies.guided.action_units import normalised_unit, normaliser_of, places_of_states
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
-from lerobot_pf2mp.policies.plans.plan_choice import DrawMore, LatencyBudget, PlanCheck, choose_plans, react
+from lerobot_pf2mp.policies.plans.plan_choice import DrawMore, PlanCheck, choose_plans, react
 from lerobot_pf2mp.policies.plans.plans import Plans, require_finite
+from lerobot_pf2mp.policies.plans.robot_places import RobotPlaces, seen_place
 from lerobot_pf2mp.potential_field import PotentialField
 from lerobot_pf2mp.training.gathering import gather_rows, is_main_process
 from lerobot_pf2mp.training.run_dataset import find_dataset, run_episodes
@@ -75,13 +75,7 @@ class FieldGuidance:
     def reset(self) -> None:
         """Forgets the plans and actions of before. Must be called at the start of an episode."""
         self.plans: Plans | None = None  # of the last call; None if they were not checked
-        self._executed: Tensor | None = None  # (B, A) the last action that `select_action` gave away
-        self._last: tuple[Tensor, Tensor] | None = None  # the last chunk (B, T, A) and where it began (B, A)
-        self._budget = LatencyBudget()
-        # Of the call that began: actions of the last chunk that were executed, and those that will be until the end of the
-        # call; None if that is unknown, or the robot waits.
-        self._n_executed: int | None = None
-        self._n_steps: int | None = None
+        self._robots = RobotPlaces()
 
     @property
     def support(self) -> Tensor | None:
@@ -163,7 +157,7 @@ class FieldGuidance:
 
     def executed(self, action: Tensor) -> None:
         """Tells that a robot, or a batch of robots, is given an action ``(B, A)`` to execute [normalised]."""
-        self._executed = action
+        self._robots.executed(action)
 
     @torch.compiler.disable
     def begin(self, left_over: Tensor | None = None, inference_delay: int = 0) -> None:
@@ -174,13 +168,7 @@ class FieldGuidance:
                 them.
             inference_delay: Number of those that are executed until the chunk is needed.
         """
-        self._n_executed = self._n_steps = None
-        if left_over is not None:
-            if self._last is not None:
-                self._n_executed = n_executed_of(self._last[0], left_over)
-            if bool(is_committed(left_over).any()):  # otherwise the robot waits
-                self._n_steps = inference_delay
-        self._budget.begin(self._n_executed)
+        self._robots.begin(left_over, inference_delay)
 
     def choose(
         self,
@@ -216,22 +204,21 @@ class FieldGuidance:
         is_checked: bool,
     ) -> Tensor:
         require_finite(chunk, batch)
-        self.plans = None
+        self.plans, places = None, None
         check = self._plan_check(batch, chunk) if is_checked else None
         if check is not None:
-            config = self.config
+            config, robots = self.config, self._robots
             known = self._places_of_robots(batch, chunk)
             places = chunk[:, 0] if known is None else known
-            has_time = self._budget.allows_another_pass(self._n_steps, config.max_plans - 1)
+            has_time = robots.budget.allows_another_pass(robots.n_steps, config.max_plans - 1)
             began = time.perf_counter()
             chunk, self.plans = choose_plans(
                 check, places, chunk, config.max_plans, draw_more if has_time else None
             )
             if bool((self.plans.n_drawn > 1).any()):
-                self._budget.took(time.perf_counter() - began)
-            chunk = react(config.on_unsupported, self.plans, chunk, known, self._n_steps or 0)
-            self._last = chunk, places
-        self._executed = self._n_executed = self._n_steps = None
+                robots.budget.took(time.perf_counter() - began)
+            chunk = react(config.on_unsupported, self.plans, chunk, known, robots.n_steps or 0)
+        self._robots.end(chunk, places)
         return chunk
 
     def _plan_check(self, batch: dict[str, Any], chunk: Tensor) -> PlanCheck | None:
@@ -270,24 +257,15 @@ class FieldGuidance:
         the chunk's first action in dimensions that the field does not cover. It is unknown without a state in the units of
         the actions.
         """
-        n_robots = len(chunk)
-        if self._executed is not None:
-            if len(self._executed) != n_robots:
-                raise ValueError(
-                    f"a batch must have as many robots as before, {len(self._executed)}, until reset() is called, got "
-                    f"{n_robots}"
-                )
-            return self._executed.to(chunk)
-        if self._last is not None and self._n_executed is not None and len(self._last[0]) == n_robots:
-            before, place = self._last
-            return (before[:, self._n_executed - 1] if self._n_executed else place).to(chunk)
+        places = self._robots(chunk)
+        if places is not None:
+            return places
         demonstrations, states = batch.get(POTENTIAL_FIELD), batch.get(OBS_STATE)
         first = chunk[:, 0]
         if not isinstance(demonstrations, DemonstratedActions) or states is None:
             return None
         states = states[:, -1] if states.ndim == 3 else states
-        calibration = demonstrations.calibration
-        if not calibration.starts_at_state or states.shape != first.shape:
+        if not demonstrations.starts_at_state(self.config.field_settings) or states.shape != first.shape:
             self._warn_once(
                 "%s has other dimensions than %s, or is not in its units: the way of a first plan begins at its first "
                 "action, not where the robot is seen.",
@@ -295,9 +273,9 @@ class FieldGuidance:
                 ACTION,
             )
             return None
-        place = demonstrations.place_of(states.to(first))
-        dims = self.config.field_settings.action_dims
-        return place if dims is None else first.index_copy(1, torch.tensor(dims, device=first.device), place)
+        return seen_place(
+            demonstrations.place_of(states.to(first)), first, self.config.field_settings.action_dims
+        )
 
 
 def fitted_field(

@@ -153,8 +153,9 @@ class FieldState:
                     f"{name} in a potential field file must be finite numbers of type {torch.float32}, got "
                     f"{value.dtype}: it is corrupted"
                 )
-        if self.n_executed.numel() != 1 or int(self.n_executed) < 1:
+        is_number = self.n_executed.numel() == 1 and self.n_executed.dtype == torch.int64
+        if not is_number or int(self.n_executed) < 1:
             raise ValueError(
-                "n_executed in a potential field file must be one number from 1 on, got "
+                f"n_executed in a potential field file must be one number of type {torch.int64} from 1 on, got "
                 f"{self.n_executed.tolist()}: it is corrupted"
             )

@@ -8,7 +8,7 @@ from collections.abc import Callable, Hashable
 import torch
 from torch import Tensor
 
-from lerobot_pf2mp.policies.plans.demonstrated_plans import DemonstratedPlans
+from lerobot_pf2mp.policies.plans.demonstrated_plans import DemonstratedPlans, states_are_places
 from lerobot_pf2mp.policies.plans.plan_threshold import PlanThreshold
 
 _REMEDY = "pf2mp-fit-field makes a field that has them, and max_plans=1 with on_unsupported=ignore needs none"
@@ -29,6 +29,7 @@ class PlanCalibration:
         """Forgets how plans are supported, because the field or the plans have changed."""
         self._scores: tuple[Hashable, int, Tensor] | None = None  # by density, and for how many actions
         self._threshold: tuple[Hashable, PlanThreshold] | None = None  # the last one
+        self._starts: tuple[Hashable, bool] | None = None  # whether plans start at the state, by periods
 
     def observe(
         self,
@@ -67,10 +68,17 @@ class PlanCalibration:
         factors, offsets = self.places.to(states)
         return factors * states + offsets
 
-    @property
-    def starts_at_state(self) -> bool:
-        """Whether an observed state tells where the robot is, in the units of its actions."""
-        return bool(self.places.numel()) and self.plans.begin_where_robots_are
+    def starts_at_state(self, periods: Tensor | None) -> bool:
+        """Whether an observed state tells where the robot is, in the units of its actions.
+
+        Args:
+            periods: ``(D,)`` periods of angles [normalised], 0 for other dimensions; None if there are no angles.
+        """
+        asked = None if periods is None else tuple(periods.tolist())
+        if self._starts is None or self._starts[0] != asked:
+            is_known = bool(self.places.numel()) and len(self.plans) > 0
+            self._starts = asked, is_known and states_are_places(self.plans.ways.cpu(), periods)
+        return self._starts[1]
 
     def threshold(
         self,

@@ -48,7 +48,6 @@ class DemonstratedPlans:
         self.ways = torch.empty(0, 0, 0)  # (E, T + 1, D) where the robot was, then T actions [normalised]
         self.episodes = torch.empty(0, dtype=torch.int64)  # (E,)
         self.ranks = torch.empty(0, dtype=torch.int64)  # (E,) of the first frames
-        self._begin_where_robots_are: bool | None = None
 
     def __len__(self) -> int:
         return len(self.ranks)
@@ -61,14 +60,6 @@ class DemonstratedPlans:
     def restore(self, ways: Tensor, episodes: Tensor, ranks: Tensor) -> None:
         """Restores plans that were saved."""
         self.ways, self.episodes, self.ranks = ways, episodes, ranks
-        self._begin_where_robots_are = None
-
-    @property
-    def begin_where_robots_are(self) -> bool:
-        """Whether ways begin at states that are places in the units of the actions, see `states_are_places`."""
-        if self._begin_where_robots_are is None:
-            self._begin_where_robots_are = len(self) > 0 and states_are_places(self.ways)
-        return self._begin_where_robots_are
 
     def observe(self, ways: Tensor, episodes: Tensor, frames: Tensor) -> bool:
         """Adds plans of a training batch, and returns whether that changed the sample.
@@ -227,7 +218,7 @@ def _has_wrong_value(
     return ((distance > limit) & beside_jump).any(dim=1)
 
 
-def states_are_places(ways: Tensor) -> bool:
+def states_are_places(ways: Tensor, periods: Tensor | None = None) -> bool:
     """Whether observed states are where the robot is, in the units of its actions.
 
     In each dimension, the median of their distance to the first action must be at most `_LARGEST_GAP` of the range of the
@@ -235,8 +226,12 @@ def states_are_places(ways: Tensor) -> bool:
 
     Args:
         ways: ``(E, T + 1, D)`` observed states, then actions [normalised].
+        periods: ``(D,)`` periods of angles [normalised], 0 for other dimensions; None if there are no angles.
     """
-    gaps = (ways[:, 1] - ways[:, 0]).abs().median(dim=0).values  # (D,)
+    steps = ways[:, 1] - ways[:, 0]
+    if periods is not None:
+        steps = wrap(steps, periods)
+    gaps = steps.abs().median(dim=0).values  # (D,)
     ordered = ways[:, 1:].flatten(0, 1).sort(dim=0).values
     low, high = (ordered[round(share * (len(ordered) - 1))] for share in (0.05, 0.95))
     return bool((gaps <= _LARGEST_GAP * (high - low) + _ROUNDING).all())
