@@ -32,6 +32,7 @@ from lerobot_pf2mp import load_policy
 from lerobot_pf2mp.commands import cli
 from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, write_dataset
 from lerobot_pf2mp.fit_field import GUIDED_TYPES, fit_field
+from lerobot_pf2mp.loading import loaded_demonstrations
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
 
 BIN = Path(sys.executable).parent
@@ -451,6 +452,17 @@ def test_a_dataset_that_is_read_in_blocks_gives_the_same_field(
     expected = contents_of(fitted("fmp"))
     monkeypatch.setattr("lerobot_pf2mp.fit_field._FRAMES_AT_ONCE", 7)
     assert contents_of(fit(checkpoint("fmp"), tmp_path / "new", shown)) == expected
+
+
+def test_a_dataset_without_states_calibrates_plans_from_their_first_actions(checkpoint, tmp_path):
+    data = write(tmp_path / "stateless", 1, 3.0, {key: FEATURES[key] for key in (ENV, ACTION)})
+    policy, preprocessor, _ = load_policy(fit(checkpoint("fmp"), tmp_path / "new", data))
+    demonstrations = loaded_demonstrations(preprocessor)
+    settings = policy.config.field_settings
+    assert not demonstrations.starts_at_state(settings)
+    assert (
+        demonstrations.plan_threshold(settings, policy.config.n_action_steps, 0.3).n_plans == 4
+    )  # one is too short
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plans are checked on their whole way, drawn again if they leave the demonstrated region, and held if none is left."""
 
+import copy
 import logging
 import math
 from typing import Any
@@ -17,7 +18,11 @@ from lerobot_pf2mp.policies.fmp.modeling_fmp import FMPPolicy
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
 from lerobot_pf2mp.policies.guided.field_settings import FieldSettings
 from lerobot_pf2mp.policies.pf2mp.modeling_pf2mp import PF2MPPolicy
-from lerobot_pf2mp.policies.plans.demonstrated_plans import DemonstratedPlans, choose_plans_of_episodes
+from lerobot_pf2mp.policies.plans.demonstrated_plans import (
+    DemonstratedPlans,
+    choose_plans_of_episodes,
+    states_are_places,
+)
 from lerobot_pf2mp.policies.plans.plan_choice import LatencyBudget, PlanCheck, choose_plans, react
 from lerobot_pf2mp.policies.plans.plans import UnsupportedPlanError
 from lerobot_pf2mp.potential_field import PotentialField
@@ -249,6 +254,18 @@ def test_states_in_other_units_are_not_where_the_robot_is() -> None:
     assert not demonstrated(episodes, states=states, places=in_degrees).calibration.starts_at_state(None)
     assert not demonstrated(episodes, states=-states, places=places).calibration.starts_at_state(None)
     assert not demonstrated(episodes).calibration.starts_at_state(None)
+
+
+def test_states_at_the_seam_of_an_angle_are_where_the_robot_is() -> None:
+    turn = 2 * math.pi
+    ways = (
+        torch.linspace(-0.4, 0.4, 11).view(11, 1, 1) + torch.tensor([0.0, 0.01, 0.02]).view(1, 3, 1) + math.pi
+    )
+    wrapped = (ways + math.pi) % turn - math.pi
+    wrapped[:, 0] = ways[:, 0]  # states that go on beyond pi, actions that do not
+    assert states_are_places(wrapped, torch.tensor([turn]))
+    assert not states_are_places(wrapped[6:], None)
+    assert states_are_places(wrapped[6:], torch.tensor([turn]))
 
 
 # The choice among plans.
@@ -585,6 +602,17 @@ def test_a_state_in_other_units_is_said_once(caplog: pytest.LogCaptureFixture) -
         for _ in range(3):
             policy.predict_action_chunk(batch)
     assert sum("or is not in its units" in r.message for r in caplog.records) == 1
+
+
+@pytest.mark.parametrize("kind", ["pf2mp", "dppf"])
+def test_a_copy_of_a_policy_follows_a_robot_of_its_own(kind: str) -> None:
+    policy = policy_of(kind, max_plans=1, on_unsupported="hold", guidance_scale=0.0)
+    policy.select_action(batch_for(policy))
+    other = copy.deepcopy(policy)
+    other.reset()
+    held = other.select_action(batch_for(other, n_robots=2, state=0.1))
+    assert torch.equal(held, torch.full((2, 2), 0.1))
+    assert torch.equal(policy.select_action(batch_for(policy)), torch.zeros(1, 2))
 
 
 @pytest.mark.parametrize("kind", ["pf2mp", "dppf"])

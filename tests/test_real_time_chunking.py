@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Real-time chunking: chunks that go on from the one that is being executed."""
 
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -220,3 +221,60 @@ def test_with_lerobots_queue_the_next_plan_begins_where_the_robot_is(n_taken: in
         torch.testing.assert_close(again, plain, rtol=1e-5, atol=1e-5)
     else:
         assert (again[0, :2] - left_over[:2]).norm() < 0.5 * (plain[0, :2] - left_over[:2]).norm()
+
+
+def continued_plan(
+    policy: PF2MPPolicy, n_taken: int = 5, between: Callable[[], None] = lambda: None
+) -> Tensor:
+    """The second chunk of a robot that has moved on the first one, and takes two more of its actions meanwhile."""
+    batch, noise = batch_for(policy), torch.ones(1, HORIZON, ACTION_DIM)
+    chunk = policy.predict_action_chunk(batch, noise=noise)
+    between()
+    return policy.predict_action_chunk(
+        batch, noise=-noise, prev_chunk_left_over=chunk[0, n_taken:], inference_delay=2
+    )
+
+
+def test_a_robot_that_moves_while_its_plan_is_made_stops_where_it_then_is() -> None:
+    policy = pf2mp(FIRM, max_plans=1, guidance_scale=0.0)
+    policy.guidance.measures_plans = True
+    planned = continued_plan(policy)
+    assert policy.plans is not None and (policy.plans.action_support < 0).all()  # of an untrained network
+    policy.reset()
+    held = continued_plan(policy, between=lambda: setattr(policy.config, "on_unsupported", "hold"))
+    assert torch.equal(held[:, :2], planned[:, :2])
+    assert torch.equal(held[:, 2:], planned[:, 1:2].expand_as(held[:, 2:]))
+
+
+@pytest.mark.parametrize(("pause", "n_drawn"), [(1.0, 8), (0.0, 1)])
+def test_another_plan_is_drawn_only_if_it_is_there_in_time(
+    pause: float, n_drawn: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = [0.0]
+
+    def perf_counter() -> float:
+        clock[0] += 0.01  # so long take the first plan, and the seven others
+        return clock[0]
+
+    def wait() -> None:
+        clock[0] += pause  # five actions were executed meanwhile
+
+    policy = pf2mp(FIRM, guidance_scale=0.0)
+    monkeypatch.setattr("lerobot_pf2mp.policies.plans.plan_choice.time.perf_counter", perf_counter)
+    continued_plan(policy, between=wait)
+    assert policy.plans is not None
+    assert policy.plans.is_flagged.all() and policy.plans.n_drawn.tolist() == [n_drawn]
+
+
+def test_a_guide_of_the_callers_own_does_not_hide_where_the_robot_is() -> None:
+    policy = pf2mp(FIRM, max_plans=1, guidance_scale=0.0)
+    policy.guidance.measures_plans = True
+    batch = batch_for(policy)
+    chunk = policy.predict_action_chunk(batch, guide=lambda x_t, x_next, x_1, dt: x_next)
+    places = policy.guidance._places_of_robots
+    seen: list[Tensor | None] = []
+    policy.guidance._places_of_robots = lambda *args: seen.append(places(*args)) or seen[-1]  # type: ignore[method-assign]
+    policy.predict_action_chunk(
+        batch, guide=lambda x_t, x_next, x_1, dt: x_next, prev_chunk_left_over=chunk[0, 5:], inference_delay=2
+    )
+    assert seen[0] is not None and torch.equal(seen[0], chunk[:, 4])
