@@ -70,12 +70,16 @@ def _parsed() -> InfoConfig:
         # draccus comes with LeRobot. Without it the report is needed most, so one option is read here.
         return InfoConfig(json="--json=true" in sys.argv[1:])
     try:
-        config = draccus.parse(InfoConfig)
+        from lerobot_pf2mp.commands.options import parse
+    except Exception:  # the package is what is to be reported on
+        parse = draccus.parse
+    try:
+        config = parse(InfoConfig)
         if not 0 < config.time_limit < math.inf:
             raise draccus.ParsingError(
                 f"time_limit must be finite and above 0 [s], got {config.time_limit:g}"
             )
-    except (draccus.utils.DecodingError, draccus.utils.ParsingError) as error:
+    except (draccus.utils.DecodingError, draccus.utils.ParsingError, OSError) as error:
         print("error:", " ".join(str(error).split()), file=sys.stderr)
         sys.exit(1)
     return config

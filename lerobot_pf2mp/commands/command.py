@@ -5,18 +5,25 @@ from __future__ import annotations
 
 import logging
 import sys
+import traceback
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
-import draccus
+from draccus.utils import ParsingError
 
 from lerobot_pf2mp import __version__
+from lerobot_pf2mp.commands.options import parse
 from lerobot_pf2mp.process.interruption import exit_code, sigterm_like_ctrl_c
 
 # Earlier names of options. They still work.
 _RENAMED = {"--picture_width": "--image_width"}
+
+FAULT_OF_OURS = (
+    "error: this is a fault of lerobot_policy_pf2mp, not of yours. Please report it where you got the package from, with "
+    "the lines above, the command and its inputs, and the output of pf2mp-info"
+)
 
 
 def answer_version() -> None:
@@ -36,20 +43,25 @@ def run(config_class: type, main: Callable[[Any], None]) -> None:
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
     try:
         with sigterm_like_ctrl_c():
-            main(draccus.parse(config_class))
+            main(parse(config_class))
     except KeyboardInterrupt as interruption:
         print("interrupted: nothing half-written was left behind", file=sys.stderr)
         sys.exit(exit_code(interruption))
-    except (
-        draccus.utils.DecodingError,
-        draccus.utils.ParsingError,
-        ValueError,
-        RuntimeError,
-        OSError,
-        ImportError,
-    ) as error:
-        print("error:", " ".join(str(error).split()), file=sys.stderr)
+    except MemoryError as error:
+        print("error: there is not enough memory:", one_line(error) or "it is full", file=sys.stderr)
         sys.exit(1)
+    except (ParsingError, ValueError, RuntimeError, OSError, ImportError) as error:
+        print("error:", one_line(error), file=sys.stderr)
+        sys.exit(1)
+    except Exception:
+        traceback.print_exc()
+        print(FAULT_OF_OURS, file=sys.stderr)
+        sys.exit(1)
+
+
+def one_line(error: BaseException) -> str:
+    """The message of an error in one line."""
+    return " ".join(str(error).split())
 
 
 def given[T](option: str, value: T | None) -> T:
