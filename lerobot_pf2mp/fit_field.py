@@ -35,6 +35,7 @@ from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldPro
 from lerobot_pf2mp.policies.guided.relative_actions import refuse_relative_actions
 from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
 from lerobot_pf2mp.policies.plans.demonstrated_plans import choose_plans_of_episodes
+from lerobot_pf2mp.policies.processor_files import check_processors
 from lerobot_pf2mp.process.atomic_files import written_beside
 
 GUIDED_TYPES = {"fmp": "pf2mp", "pf2mp": "pf2mp", "diffusion": "dppf", "dppf": "dppf"}
@@ -170,8 +171,7 @@ def _normaliser_for(config: PreTrainedConfig, dataset: LeRobotDataset) -> Normal
 def _load_processors(
     config: PreTrainedConfig, checkpoint: str, revision: str | None
 ) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
-    if Path(checkpoint).is_dir() and not (Path(checkpoint) / "policy_preprocessor.json").is_file():
-        raise FileNotFoundError("it has no policy_preprocessor.json")
+    check_processors(checkpoint, revision, must_exist=True)
     return make_pre_post_processors(
         config,
         pretrained_path=checkpoint,

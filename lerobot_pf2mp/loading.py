@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -19,11 +20,17 @@ from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActio
 from lerobot_pf2mp.policies.guided.field_guidance import fitted_field
 from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
 from lerobot_pf2mp.policies.guided.relative_actions import refuse_relative_actions
+from lerobot_pf2mp.policies.processor_files import check_processors, trusting
 from lerobot_pf2mp.potential_field import PotentialField
 
 
 def load_policy(
-    path: str | Path, *, revision: str | None = None, device: str | None = None, **overrides: Any
+    path: str | Path,
+    *,
+    revision: str | None = None,
+    device: str | None = None,
+    trust: Sequence[str] = (),
+    **overrides: Any,
 ) -> tuple[
     PreTrainedPolicy,
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
@@ -35,6 +42,7 @@ def load_policy(
         path: A checkpoint's ``pretrained_model`` folder, or a repository on the Hub.
         revision: Branch, tag or commit on the Hub.
         device: Device of the policy, for example ``cuda``; None for the best available one.
+        trust: Classes of processor steps, by their full names, that may be imported although they are not registered.
         **overrides: Fields of the policy's configuration to change, for example ``guidance_scale=0.4``.
 
     Returns:
@@ -43,12 +51,21 @@ def load_policy(
     Raises:
         FileNotFoundError: If the path is neither a folder nor the name of a repository.
         OSError: If the checkpoint cannot be read or reached.
-        ValueError: If an option does not exist or cannot have its value, a file is damaged, guidance is on without a
-            potential field, or actions are relative beside one.
+        ValueError: If an option does not exist or cannot have its value, a file is damaged, a processor step is neither
+            registered nor trusted, guidance is on without a potential field, or actions are relative beside one.
     """
+    with trusting(trust):
+        return _load(path, revision, device, overrides)
+
+
+def _load(
+    path: str | Path, revision: str | None, device: str | None, overrides: dict[str, Any]
+) -> tuple[PreTrainedPolicy, PolicyProcessorPipeline, PolicyProcessorPipeline]:
     config = load_config(path, revision=revision, device=device, **overrides)
     path = str(config.pretrained_path)
     where = f"the checkpoint {path}{f' at revision {revision}' if revision else ''}"
+    with explained(f"{where} is not loaded"):
+        check_processors(path, revision, must_exist=True)
     with explained(f"the weights of {where} cannot be loaded"):
         policy = get_policy_class(config.type).from_pretrained(path, config=config, revision=revision)
     with explained(f"the processors of {where} cannot be loaded"):

@@ -232,7 +232,7 @@ def test_the_server_answers_lerobots_own_client(
 def test_the_server_says_what_is_missing(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     monkeypatch.setitem(sys.modules, "grpc", None)
     for name in list(sys.modules):
-        if name.startswith("lerobot.async_inference"):
+        if name.startswith(("lerobot.async_inference", "lerobot_pf2mp.serving")):
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setattr(sys, "argv", ["pf2mp-policy-server"])
     with pytest.raises(SystemExit, match="1"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import redirect_stdout
 from typing import Any
 
@@ -13,30 +13,32 @@ from .line import OPTIONAL, PROBLEM, Line
 from .probes import message_of
 
 
-def checkpoint_lines(path: str) -> Iterator[Line]:
+def checkpoint_lines(path: str, trust: Sequence[str] = ()) -> Iterator[Line]:
     """The lines of a checkpoint, which is loaded as a whole.
 
     Args:
         path: Its ``pretrained_model`` folder, or a repository on the Hub.
+        trust: Classes of processor steps that may be imported although they are not registered.
     """
     level = logging.root.manager.disable
     logging.disable(logging.WARNING)  # each finding is a line of the report
     try:
-        yield from _lines(path)
+        yield from _lines(path, trust)
     finally:
         logging.disable(level)
 
 
-def _lines(path: str) -> Iterator[Line]:
+def _lines(path: str, trust: Sequence[str]) -> Iterator[Line]:
     try:
         from lerobot_pf2mp import load_policy
 
         with redirect_stdout(sys.stderr):  # LeRobot prints; this command's own output may be JSON
-            policy, preprocessor, _ = load_policy(path, device="cpu")
+            policy, preprocessor, _ = load_policy(path, device="cpu", trust=trust)
     except Exception as error:
-        yield Line("policy", "cannot be loaded", PROBLEM, message_of(error))
+        yield Line("policy", "cannot be loaded", PROBLEM, message_of(error, longest=1000))
         return
     config = policy.config
+    yield Line("processors", "registered or trusted steps only")
     yield Line("policy", f"{config.type}, chunks of {config.n_action_steps} actions")
     if not hasattr(config, "guidance_scale"):
         yield Line(

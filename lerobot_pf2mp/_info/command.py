@@ -19,6 +19,8 @@ class CheckpointConfig:
 
     # Its pretrained_model folder, or a repository on the Hub.
     path: str = ""
+    # Classes of processor steps that may be imported although they are not registered, by their full names.
+    trust: list[str] = field(default_factory=list)
 
 
 @dataclass
@@ -53,7 +55,7 @@ def main() -> None:
     lines = []
     try:
         path = config.policy.path
-        for line in checkpoint_lines(path) if path else gather(config.time_limit):
+        for line in checkpoint_lines(path, config.policy.trust) if path else gather(config.time_limit):
             lines.append(line)
             if not config.json:
                 print(as_row(line), flush=True)
@@ -70,11 +72,11 @@ def _parsed() -> InfoConfig:
         # draccus comes with LeRobot. Without it the report is needed most, so one option is read here.
         return InfoConfig(json="--json=true" in sys.argv[1:])
     try:
-        from lerobot_pf2mp.commands.options import parse
+        from lerobot_pf2mp.commands.options import parse as parse_as_typed
     except Exception:  # the package is what is to be reported on
-        parse = draccus.parse
+        parse_as_typed = draccus.parse  # type: ignore[assignment]
     try:
-        config = parse(InfoConfig)
+        config = parse_as_typed(InfoConfig)
         if not 0 < config.time_limit < math.inf:
             raise draccus.ParsingError(
                 f"time_limit must be finite and above 0 [s], got {config.time_limit:g}"

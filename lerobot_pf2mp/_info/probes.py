@@ -31,10 +31,10 @@ _SIDE = 64  # side of the images [pixels]
 _LONGEST = 300  # longest message of an error [characters]
 
 
-def message_of(error: BaseException) -> str:
+def message_of(error: BaseException, longest: int = _LONGEST) -> str:
     """The type and message of an error, in one line of limited length."""
     words = " ".join([type(error).__name__ + ":" * bool(str(error)), *str(error).split()])
-    return words if len(words) <= _LONGEST else words[: _LONGEST - 3] + "..."
+    return words if len(words) <= longest else words[: longest - 3] + "..."
 
 
 def discovery() -> dict[str, Any]:

@@ -56,6 +56,8 @@ class BenchmarkConfig:
     device: str = "cpu"
     # Number of parallel processes, with one thread each; 1 uses all threads in one process.
     n_processes: int = 1
+    # Classes of processor steps of a checkpoint that may be imported although they are not registered, by full names.
+    trust: list[str] = field(default_factory=list)
     # Folder of episodes.csv, summary.csv, table.md, table.tex and run.json.
     output_dir: Path = Path("outputs/benchmark")
 

@@ -4,10 +4,13 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 import traceback
+from argparse import ArgumentError
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -16,6 +19,9 @@ from draccus.utils import ParsingError
 from lerobot_pf2mp import __version__
 from lerobot_pf2mp.commands.options import parse
 from lerobot_pf2mp.process.interruption import exit_code, sigterm_like_ctrl_c
+
+# Read by `processor_files`. Importing it would import LeRobot.
+TRUST_VARIABLE = "PF2MP_TRUST"
 
 # Earlier names of options. They still work.
 _RENAMED = {"--picture_width": "--image_width"}
@@ -42,15 +48,31 @@ def run(config_class: type, main: Callable[[Any], None]) -> None:
     # LeRobot's lengthy warning about a video decoder that these commands do not use.
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
     try:
-        with sigterm_like_ctrl_c():
-            main(parse(config_class))
+        with errors_in_one_line(), sigterm_like_ctrl_c():
+            config: Any = parse(config_class)
+            trust_steps(getattr(config, "trust", ()))
+            main(config)
     except KeyboardInterrupt as interruption:
         print("interrupted: nothing half-written was left behind", file=sys.stderr)
         sys.exit(exit_code(interruption))
+
+
+def trust_steps(classes: Sequence[str]) -> None:
+    """Lets this process, and those that it starts, import these classes of processor steps (see `processor_files`)."""
+    trusted = [*filter(None, classes), *filter(None, os.environ.get(TRUST_VARIABLE, "").split(","))]
+    if trusted:
+        os.environ[TRUST_VARIABLE] = ",".join(trusted)
+
+
+@contextmanager
+def errors_in_one_line() -> Iterator[None]:
+    """Ends the process with code 1 after an error: one line if a user can cause it, a traceback if the fault is ours."""
+    try:
+        yield
     except MemoryError as error:
         print("error: there is not enough memory:", one_line(error) or "it is full", file=sys.stderr)
         sys.exit(1)
-    except (ParsingError, ValueError, RuntimeError, OSError, ImportError) as error:
+    except (ParsingError, ArgumentError, ValueError, RuntimeError, OSError, ImportError) as error:
         print("error:", one_line(error), file=sys.stderr)
         sys.exit(1)
     except Exception:

@@ -92,6 +92,8 @@ class FitFieldConfig:
     output_dir: Path | None = None
     # Folder of a new report: report.html, report.json and figures.
     report: Path | None = None
+    # Classes of processor steps of a checkpoint that may be imported although they are not registered, by full names.
+    trust: list[str] = field(default_factory=list)
     # Whether to replace an existing checkpoint and report.
     overwrite: bool = False
 

@@ -88,6 +88,42 @@ def read_option(config_class: type, name: str, text: str) -> Any:
         raise ParsingError(f"--{name} must be plain YAML, got {text!r}: {_in_one_line(error)}") from error
 
 
+def quoted_texts(config_class: type, args: Sequence[str]) -> list[str]:
+    """A command line for a command of LeRobot, which draccus reads, with texts and paths quoted where YAML needs it.
+
+    Args:
+        config_class: The dataclass of the command's options.
+        args: What was typed.
+
+    Raises:
+        ParsingError: If the configuration file is no plain YAML.
+        OSError: If it does not exist.
+    """
+    quoted = []
+    for number, argument in enumerate(args):
+        name, equals, text = argument.removeprefix("--").partition("=")
+        if name == CONFIG_ARG:
+            path = text if equals else "".join(args[number + 1 : number + 2])
+            if Path(path).suffix or not _may_be_on_the_hub(path):
+                read_config_file(path, config_class)
+        # LeRobot itself reads these as they stand.
+        is_raw = name.rpartition(".")[2] in (CONFIG_ARG, "type", "path", "discover_packages_path")
+        if (
+            argument.startswith("--")
+            and equals
+            and not is_raw
+            and _is_text(_kinds_at(config_class, name.split(".")))
+        ):
+            argument = f"--{name}={text if text == 'null' else json.dumps(text, ensure_ascii=False)}"
+        quoted.append(argument)
+    return quoted
+
+
+def _may_be_on_the_hub(path: str) -> bool:
+    where = Path(path)
+    return not where.exists() and not where.is_absolute() and len(where.parts) == 2
+
+
 def read_config_file(path: str | Path, config_class: type) -> dict[str, Any]:
     """The options in a configuration file: YAML, or JSON or TOML by the file's ending.
 

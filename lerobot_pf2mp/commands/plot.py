@@ -50,6 +50,8 @@ class PlotConfig:
     episodes: list[int] = field(default_factory=list)
     # Number of episodes to draw if --episodes is empty; for flow, number of chunks.
     n_episodes: int = 6
+    # Classes of processor steps of a checkpoint that may be imported although they are not registered, by full names.
+    trust: list[str] = field(default_factory=list)
     # Seed of the first episode; episode i has this seed + i.
     seed: int = 100000
     # light or dark.

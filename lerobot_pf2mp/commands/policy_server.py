@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+import math
+from dataclasses import asdict, dataclass, field
 
 POLICIES = ("fmp", "pf2mp", "dppf")
 
@@ -20,6 +21,8 @@ class PolicyServerConfig:
     LeRobot's client and server exchange pickles, so anybody who can connect to the port can run code on this machine. Let it
     listen on 127.0.0.1, the default, and use a tunnel to connect from another machine.
 
+    One client is served at a time; another one is refused until the first has been silent for --client_timeout.
+
     Examples:
         pf2mp-policy-server
         pf2mp-policy-server --port=9000 --fps=10 --inference_latency=0.1
@@ -35,21 +38,29 @@ class PolicyServerConfig:
     inference_latency: float = 1 / 30
     # Longest wait for an observation [s].
     obs_queue_timeout: float = 2.0
+    # Time after which a silent client is taken to have left, so that another one may come [s].
+    client_timeout: float = 30.0
+    # Classes of processor steps of a checkpoint that may be imported although they are not registered, by full names.
+    trust: list[str] = field(default_factory=list)
 
 
 def main(config: PolicyServerConfig) -> None:
     """Runs the command."""
     if config.fps < 1:
         raise ValueError(f"fps must be at least 1 Hz, got {config.fps}")
+    if not (config.client_timeout > 0 and math.isfinite(config.client_timeout)):
+        raise ValueError(f"client_timeout must be finite and above 0 s, got {config.client_timeout:g}")
     try:
-        from lerobot.async_inference import configs, constants, policy_server
+        from lerobot.async_inference import configs, constants
+
+        from lerobot_pf2mp.serving import serve
     except ImportError as error:
         raise ImportError(
             f'pf2mp-policy-server needs: pip install "lerobot_policy_pf2mp[async]" ({error})'
         ) from error
-    server_config = configs.PolicyServerConfig(**asdict(config))
+    options = {key: value for key, value in asdict(config).items() if key not in ("client_timeout", "trust")}
     # The server checks the policy type against this list.
     constants.SUPPORTED_POLICIES.extend(
         policy for policy in POLICIES if policy not in constants.SUPPORTED_POLICIES
     )
-    policy_server.serve(server_config)
+    serve(configs.PolicyServerConfig(**options), config.client_timeout)

@@ -38,6 +38,8 @@ class PushConfig:
     figures: list[Path] = field(default_factory=list)
     # Name of the dataset on the Hub; by default the one that the policy was trained on.
     dataset: str | None = None
+    # Classes of processor steps of a checkpoint that may be imported although they are not registered, by full names.
+    trust: list[str] = field(default_factory=list)
     # Branch to publish to, created if it does not exist; by default main.
     branch: str | None = None
 

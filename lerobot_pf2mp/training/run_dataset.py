@@ -13,6 +13,8 @@ from typing import Any
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.streaming_dataset import StreamingLeRobotDataset
 
+from lerobot_pf2mp.errors import ConfigError
+
 
 def find_dataset(dataset_meta: Any) -> LeRobotDataset | StreamingLeRobotDataset | None:
     """The dataset whose metadata is this very object; None if there is none.
@@ -35,8 +37,16 @@ def run_episodes(dataset_meta: Any) -> list[int] | None:
 
     Args:
         dataset_meta: The metadata that LeRobot gave to the policy; None at evaluation.
+
+    Raises:
+        ConfigError: If the dataset is streamed and only some episodes are asked for. LeRobot 0.6 streams all of them.
     """
     dataset = find_dataset(dataset_meta)
+    if isinstance(dataset, StreamingLeRobotDataset) and dataset.episodes is not None:
+        raise ConfigError(
+            "dataset.episodes must be unset with --dataset.streaming=true, because LeRobot then reads all episodes, got "
+            f"{len(dataset.episodes)} of {dataset_meta.total_episodes}: the potential field would cover the others too"
+        )
     if dataset is None or dataset.episodes is None or len(dataset.episodes) == dataset_meta.total_episodes:
         return None
     return [int(episode) for episode in dataset.episodes]

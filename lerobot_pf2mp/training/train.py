@@ -12,9 +12,11 @@ import logging
 from typing import Any
 
 from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.factory import make_train_eval_datasets
 from lerobot.scripts import lerobot_train
 
+from lerobot_pf2mp.errors import explained
 from lerobot_pf2mp.training.in_memory_dataset import InMemoryDataset, fits_in_memory
 
 
@@ -26,13 +28,36 @@ def train(limit_gb: float) -> None:
     """
 
     def make_datasets(config: TrainPipelineConfig) -> tuple[Any, Any]:
-        return tuple(
-            _in_memory(config, dataset, limit_gb * 1e9) for dataset in make_train_eval_datasets(config)
-        )
+        _check_episodes(config)
+        with explained(f"the dataset {config.dataset.repo_id} cannot be loaded"):
+            datasets = make_train_eval_datasets(config)
+        return tuple(_in_memory(config, dataset, limit_gb * 1e9) for dataset in datasets)
 
     # The training function gets its data only from here. LeRobot 0.6 has no plug-in point for it.
     lerobot_train.make_train_eval_datasets = make_datasets
     lerobot_train.main()
+
+
+def _check_episodes(config: TrainPipelineConfig) -> None:
+    """Raises a ValueError if the dataset does not have the episodes that are asked for, or LeRobot would not heed them."""
+    episodes = config.dataset.episodes
+    if episodes is None:
+        return
+    if config.dataset.streaming:
+        raise ValueError(
+            "dataset.episodes must be unset with --dataset.streaming=true, because LeRobot then reads all episodes, got "
+            f"{len(episodes)} episodes"
+        )
+    with explained(f"the dataset {config.dataset.repo_id} cannot be loaded"):
+        meta = LeRobotDatasetMetadata(
+            config.dataset.repo_id, root=config.dataset.root, revision=config.dataset.revision
+        )
+    missing = [episode for episode in episodes if not 0 <= episode < meta.total_episodes]
+    if missing or not episodes:
+        raise ValueError(
+            f"dataset.episodes must be numbers of episodes, from 0 to {meta.total_episodes - 1}, got "
+            f"{missing or 'none'}"
+        )
 
 
 def _in_memory(config: TrainPipelineConfig, dataset: Any, limit_bytes: float) -> Any:

@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Configuration of the Diffusion Policy with Potential Field Guidance."""
 
+import sys
 from dataclasses import dataclass
 
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
+from lerobot.policies.pretrained import PreTrainedPolicy
 
-from lerobot_pf2mp.errors import reported_on_the_command_line
+from lerobot_pf2mp.errors import ConfigError, reported_on_the_command_line
 from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
+from lerobot_pf2mp.policies.option_kinds import check_kinds_and_sizes
 
 
 @PreTrainedConfig.register_subclass("dppf")
@@ -33,6 +36,7 @@ class DPPFConfig(GuidedConfig, DiffusionConfig):
             ConfigError: If one breaks its rule.
         """
         with reported_on_the_command_line():
+            check_kinds_and_sizes(self)
             super().__post_init__()
             self._validate_guidance()
             n_steps = self.num_inference_steps
@@ -46,6 +50,21 @@ class DPPFConfig(GuidedConfig, DiffusionConfig):
 
         Raises:
             ValueError: If they do not fit.
+            ConfigError: If LeRobot's own `DiffusionPolicy` is opened with this configuration. It would be unguarded.
         """
+        _refuse_other_policies()
         super().validate_features()
         self._validate_field_dims(self.action_feature)
+
+
+def _refuse_other_policies() -> None:
+    """Raises a ConfigError if the caller's caller is LeRobot's own policy, which says nothing of a field that it ignores.
+
+    It has no place where a configuration could tell it. But it begins by checking the features of its configuration.
+    """
+    opening = sys._getframe(2).f_locals.get("self")
+    if isinstance(opening, PreTrainedPolicy) and getattr(opening, "name", None) != "dppf":
+        raise ConfigError(
+            "a dppf checkpoint must be opened as a policy of type dppf, got diffusion: without the potential field it "
+            "would be unguarded"
+        )

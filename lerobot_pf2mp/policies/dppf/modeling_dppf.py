@@ -13,14 +13,14 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
 from lerobot_pf2mp.flow_matching import Guide
+from lerobot_pf2mp.policies.checked_loading import require_own_config
 from lerobot_pf2mp.policies.dppf.configuration_dppf import DPPFConfig
 from lerobot_pf2mp.policies.guided.field_guidance import FieldGuidance
-from lerobot_pf2mp.policies.model_card import WithModelCard
+from lerobot_pf2mp.policies.own_policy import OwnPolicy
 from lerobot_pf2mp.policies.plans.plans import Plans
-from lerobot_pf2mp.policies.without_peft import WithoutPEFT
 
 
-class DPPFPolicy(WithoutPEFT, WithModelCard, DiffusionPolicy):
+class DPPFPolicy(OwnPolicy, DiffusionPolicy):
     """`DiffusionPolicy` with a potential field. It adds to it what `PF2MPPolicy` adds to `FMPPolicy`.
 
     Training also adds its actions to the field, the guide changes every denoising step, and each chunk is checked, and
@@ -44,6 +44,7 @@ class DPPFPolicy(WithoutPEFT, WithModelCard, DiffusionPolicy):
         dataset_meta: Any = None,
         **kwargs: Any,
     ) -> None:
+        require_own_config(self, config)
         # Before DiffusionPolicy.__init__, which calls `reset`.
         self.guidance = FieldGuidance(config, dataset_stats, dataset_meta)
         super().__init__(config, **kwargs)

@@ -11,6 +11,7 @@ from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from lerobot_pf2mp.errors import reported_on_the_command_line
 from lerobot_pf2mp.flow_matching import INTEGRATORS, TIME_SAMPLINGS
 from lerobot_pf2mp.policies.fmp.fused_adamw import FusedAdamWConfig
+from lerobot_pf2mp.policies.option_kinds import check_kinds_and_sizes
 
 
 @PreTrainedConfig.register_subclass("fmp")
@@ -125,6 +126,7 @@ class FMPConfig(PreTrainedConfig):
             self._validate()
 
     def _validate(self) -> None:
+        check_kinds_and_sizes(self)
         for name in ("n_obs_steps", "horizon", "n_action_steps", "num_inference_steps", "n_groups"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")

@@ -16,13 +16,13 @@ from torch import Tensor
 
 from lerobot_pf2mp.flow_matching import Guide, flow_matching_loss, integrate, sample_time
 from lerobot_pf2mp.policies.batch_keys import ACTION_IS_PAD
+from lerobot_pf2mp.policies.checked_loading import require_own_config
 from lerobot_pf2mp.policies.fmp.configuration_fmp import FMPConfig
 from lerobot_pf2mp.policies.fmp.ema import MovingAverage
 from lerobot_pf2mp.policies.fmp.networks import VelocityNetwork
 from lerobot_pf2mp.policies.fmp.real_time_chunking import continuing
-from lerobot_pf2mp.policies.model_card import WithModelCard
+from lerobot_pf2mp.policies.own_policy import OwnPolicy
 from lerobot_pf2mp.policies.plans.plans import require_finite
-from lerobot_pf2mp.policies.without_peft import WithoutPEFT
 
 
 class Draw(Protocol):
@@ -46,7 +46,7 @@ class Draw(Protocol):
         """
 
 
-class FMPPolicy(WithoutPEFT, WithModelCard, PreTrainedPolicy):
+class FMPPolicy(OwnPolicy, PreTrainedPolicy):
     """Generates chunks of actions by integrating a learned velocity field from noise.
 
     Of a chunk of `horizon` actions, counted from the oldest of `n_obs_steps` observations, the `n_action_steps` from
@@ -74,6 +74,7 @@ class FMPPolicy(WithoutPEFT, WithModelCard, PreTrainedPolicy):
         dataset_meta: Any = None,
         **kwargs: Any,
     ) -> None:
+        require_own_config(self, config)
         super().__init__(config)
         config.validate_features()
         self.network = VelocityNetwork(config)

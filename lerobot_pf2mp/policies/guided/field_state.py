@@ -8,6 +8,11 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from lerobot_pf2mp.density.bandwidth import check_bandwidth
+
+# Points are normalised. Wrong values of sensors may be millions, but squares of points must stay numbers.
+_LARGEST = 1e12
+
 # The role of a point.
 OUTLYING, ANCHOR, SAFE_ANCHOR = 0, 1, 2
 
@@ -76,9 +81,9 @@ class FieldState:
                 f"a potential field file must hold {sorted(wanted)}, got {sorted(tensors)}: it is corrupted"
             )
         points, ranks = tensors["points"], tensors["ranks"]
-        if points.ndim != 2 or ranks.shape != points.shape[:1] or not torch.isfinite(points).all():
+        if points.ndim != 2 or ranks.shape != points.shape[:1] or not bool((points.abs() < _LARGEST).all()):
             raise ValueError(
-                "a potential field file must hold finite points (P, D) with P ranks, got points "
+                f"a potential field file must hold finite points (P, D), below {_LARGEST:g}, with P ranks, got points "
                 f"{tuple(points.shape)} and ranks {tuple(ranks.shape)}: it is corrupted"
             )
         for name in ("n_shown", "bandwidth", "log_threshold"):
@@ -87,6 +92,12 @@ class FieldState:
                     f"{name} in a potential field file must be one number, got {tuple(tensors[name].shape)}: "
                     "it is corrupted"
                 )
+        check_bandwidth(tensors["bandwidth"].item(), "bandwidth in a potential field file")
+        if not bool(tensors["log_threshold"].isfinite()):
+            raise ValueError(
+                f"log_threshold in a potential field file must be finite, got {tensors['log_threshold'].item()}: it is "
+                "corrupted"
+            )
         defaults = {
             "episodes": torch.full((len(points),), -1),
             "unit": torch.empty(0),

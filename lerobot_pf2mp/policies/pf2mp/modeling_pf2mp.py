@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from lerobot_pf2mp.flow_matching import Guide
+from lerobot_pf2mp.policies.checked_loading import require_own_config
 from lerobot_pf2mp.policies.fmp.modeling_fmp import FMPPolicy
 from lerobot_pf2mp.policies.guided.field_guidance import FieldGuidance
 from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
@@ -42,6 +43,7 @@ class PF2MPPolicy(FMPPolicy):
         dataset_meta: Any = None,
         **kwargs: Any,
     ) -> None:
+        require_own_config(self, config)
         # Before FMPPolicy.__init__, which calls `reset`.
         self.guidance = FieldGuidance(config, dataset_stats, dataset_meta)
         super().__init__(config, dataset_stats, dataset_meta, **kwargs)
