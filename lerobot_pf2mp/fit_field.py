@@ -108,8 +108,9 @@ def fit_field(
         for old in preprocessor.steps:
             if isinstance(old, DeviceProcessorStep):
                 old.device = str(device)
-        for part in (policy, preprocessor, postprocessor):
-            part.save_pretrained(new)
+        with explained(f"the checkpoint {output_dir} cannot be written"):
+            for part in (policy, preprocessor, postprocessor):
+                part.save_pretrained(new)
     return guided
 
 

@@ -101,3 +101,35 @@ if __name__ == "__main__":
     result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, cwd=tmp_path)
     assert (result.stdout, result.stderr) == ("BrokenProcessPool\n", "")
     assert (tmp_path / "imported").exists()
+
+
+ORPHANS = """
+import os, time
+from lerobot_pf2mp.process.worker_pool import worker_pool
+
+def work(number):
+    print(os.getpid(), flush=True)
+    time.sleep(600)
+
+def prepare():
+    pass
+
+if __name__ == "__main__":
+    with worker_pool(2, prepare, ()) as pool:
+        list(pool.map(work, range(2)))
+"""
+
+
+@pytest.mark.slow
+def test_workers_end_with_their_parent_however_it_ends(tmp_path: Path) -> None:
+    script = tmp_path / "orphans.py"
+    script.write_text(ORPHANS)
+    process = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    workers = [int(process.stdout.readline()) for _ in range(2)]
+    process.kill()
+    process.wait()
+    deadline = time.monotonic() + 30
+    while any(Path(f"/proc/{worker}").exists() for worker in workers):
+        assert time.monotonic() < deadline, "a worker is still there"
+        time.sleep(0.05)

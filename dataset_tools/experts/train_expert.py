@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import sys
 import warnings
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from tqdm import tqdm
 
 from lerobot_pf2mp.dataset_tools.experts.expert_checkpoint import EXPERT_FILE, ExpertCheckpoint
 from lerobot_pf2mp.dataset_tools.experts.expert_settings import ExpertSettings
+from lerobot_pf2mp.process.claims import claimed
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -58,6 +60,17 @@ def train_expert(
     if device != "cpu" and not (device.startswith("cuda") and torch.cuda.is_available()):
         raise ValueError(f"device must be cpu, or cuda where there is such a GPU, got {device!r}")
     wanted = ExpertSettings.of(task, algo, **settings)
+    with claimed(output_dir):
+        try:
+            return _continue(wanted, total_steps, output_dir, save_freq, device)
+        finally:
+            with suppress(OSError):  # not empty, or never made
+                output_dir.rmdir()
+
+
+def _continue(
+    wanted: ExpertSettings, total_steps: int, output_dir: Path, save_freq: int, device: str
+) -> ExpertCheckpoint:
     checkpoint = _found(output_dir, wanted)
     if checkpoint is not None and checkpoint.n_steps >= total_steps:
         return checkpoint

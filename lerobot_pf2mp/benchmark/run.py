@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import torch
 from tqdm import tqdm
@@ -25,6 +26,7 @@ from lerobot_pf2mp.benchmark.spec import NONE, BenchmarkSpec, Job
 from lerobot_pf2mp.loading import load_config
 from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
 from lerobot_pf2mp.process.atomic_files import file_written_beside
+from lerobot_pf2mp.process.claims import claimed
 from lerobot_pf2mp.results.rows import EpisodeRow, SummaryRow, format_row, read_rows, write_rows
 from lerobot_pf2mp.results.summary import group_cells, summarise
 from lerobot_pf2mp.results.tables import make_latex, make_markdown
@@ -50,9 +52,15 @@ def run_benchmark(spec: BenchmarkSpec, output_dir: Path, *, n_processes: int = 1
     Raises:
         ValueError: If `output_dir` holds a benchmark with other episodes, or of other policies with the same names.
         FileNotFoundError: If a checkpoint does not exist.
+        FileExistsError: If another process is writing there.
     """
     if n_processes < 1:
         raise ValueError(f"n_processes must be at least 1, got {n_processes}")
+    with claimed(output_dir):
+        return _run(spec, output_dir, n_processes)
+
+
+def _run(spec: BenchmarkSpec, output_dir: Path, n_processes: int) -> list[SummaryRow]:
     jobs = _make_jobs(spec)
     output_dir.mkdir(parents=True, exist_ok=True)
     episodes = output_dir / "episodes.csv"
@@ -150,7 +158,7 @@ def _claim(output_dir: Path, spec: BenchmarkSpec) -> None:
     episodes["env"].pop("task")
     variants = spec.variants
     if mark.exists():
-        found = json.loads(mark.read_text(encoding="utf-8"))
+        found = _read_mark(mark)
         if found["episodes"] != json.loads(json.dumps(episodes)):
             raise ValueError(
                 f"{output_dir} holds a benchmark over other episodes ({found['episodes']}), got {episodes}: choose another "
@@ -177,6 +185,25 @@ def _claim(output_dir: Path, spec: BenchmarkSpec) -> None:
     }
     with file_written_beside(mark) as partial:
         partial.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def _read_mark(mark: Path) -> dict[str, dict[str, Any]]:
+    """What another call has written into ``run.json``.
+
+    Raises:
+        ValueError: If no call of `run_benchmark` has written it.
+    """
+    try:
+        found = json.loads(mark.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{mark} must be one that pf2mp-benchmark has written: {error}") from error
+    parts = [found.get(name) for name in ("episodes", "variants")] if isinstance(found, dict) else [None]
+    if not all(isinstance(part, dict) for part in parts):
+        raise ValueError(
+            f"{mark} must be one that pf2mp-benchmark has written, with episodes and variants, got another one: choose "
+            "another --output_dir"
+        )
+    return found
 
 
 def _describe_machine(device: str) -> str:

@@ -35,12 +35,15 @@ class DemoConfig:
 def main(config: DemoConfig) -> None:
     """Runs the command."""
     from lerobot_pf2mp.commands.demo_stages import run_demo
+    from lerobot_pf2mp.process.claims import claimed
 
-    run_demo(
-        config.output_dir.expanduser(),
-        task=config.task,
-        n_demonstrations=config.n_demonstrations,
-        steps=config.steps,
-        n_episodes=config.n_episodes,
-        seed=config.seed,
-    )
+    output_dir = config.output_dir.expanduser()
+    with claimed(output_dir):
+        run_demo(
+            output_dir,
+            task=config.task,
+            n_demonstrations=config.n_demonstrations,
+            steps=config.steps,
+            n_episodes=config.n_episodes,
+            seed=config.seed,
+        )

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 
 from lerobot_pf2mp.commands.command import answer_version, errors_in_one_line, trust_steps
@@ -42,14 +44,19 @@ def main() -> None:
     try:
         with errors_in_one_line(), sigterm_like_ctrl_c():
             limit_gb = _take_memory_limit()
+            from lerobot.configs.parser import parse_arg
             from lerobot.configs.train import TrainPipelineConfig
 
+            from lerobot_pf2mp.process.claims import claimed
             from lerobot_pf2mp.training.train import train
 
             trust_steps(_take_option(TRUST_OPTION).strip("[]").split(","))
             _check_checkpoint(sys.argv[1:])
+            output_dir = parse_arg("output_dir", sys.argv[1:])
             sys.argv[1:] = quoted_texts(TrainPipelineConfig, sys.argv[1:])
-            train(limit_gb)
+            is_first = os.environ.get("RANK", "0") == os.environ.get("LOCAL_RANK", "0") == "0"
+            with claimed(Path(output_dir)) if output_dir and is_first else nullcontext():
+                train(limit_gb)
     except KeyboardInterrupt as interruption:
         print(
             "\ninterrupted: training continues from the last checkpoint with --resume=true", file=sys.stderr

@@ -4,10 +4,13 @@
 from __future__ import annotations
 
 import shutil
-import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
+
+from lerobot_pf2mp.process.claims import claimed, workspace_of
+from lerobot_pf2mp.process.interruption import uninterrupted
+from lerobot_pf2mp.process.renaming import exchange, rename_to_new
 
 
 @contextmanager
@@ -19,14 +22,18 @@ def file_written_beside(path: Path) -> Iterator[Path]:
 
     Yields:
         The path of the temporary file, which has the same suffix and does not exist yet.
+
+    Raises:
+        FileExistsError: If another process is writing the file.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".partial.{path.name}")
-    try:
-        yield partial
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with claimed(path):
+        partial = path.with_name(f".partial.{path.name}")
+        try:
+            yield partial
+            partial.replace(path)
+        finally:
+            with uninterrupted():
+                partial.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -44,40 +51,33 @@ def written_beside(folder: Path, overwrite: bool, *, kind: str, mark: str, optio
         The path of the temporary folder, which does not exist yet.
 
     Raises:
-        FileExistsError: If the folder exists and `overwrite` is false, or it is of another kind.
+        FileExistsError: If the folder exists, or appears in the meantime, and `overwrite` is false, if it is of another
+            kind, or if another process is writing it.
     """
     folder = Path(folder)
-    if folder.exists():
-        if not overwrite:
-            raise FileExistsError(
-                f"{folder} exists already: choose another {option}, or pass --overwrite=true"
-            )
-        if not (folder / mark).is_file():
-            raise FileExistsError(
-                f"{folder} is no {kind}, it holds no {mark}, and will not be overwritten: choose another {option}"
-            )
-    made = [parent for parent in folder.absolute().parents if not parent.exists()]
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    workspace = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".partial", dir=folder.parent))
-    try:
-        partial = workspace / "new"
-        yield partial
-        _swap(partial, folder, spare=workspace / "old")
-    finally:
-        shutil.rmtree(workspace, ignore_errors=True)
-        for parent in made:
-            with suppress(OSError):  # not empty, for example because it holds the new folder
-                parent.rmdir()
+    with claimed(folder):
+        _check_replaceable(folder, overwrite, kind, mark, option)
+        workspace = workspace_of(folder)
+        workspace.mkdir()
+        try:
+            new = workspace / "new"
+            yield new
+            if folder.exists():
+                _check_replaceable(folder, overwrite, kind, mark, option)
+                exchange(new, folder, workspace / "old")
+            else:
+                rename_to_new(new, folder)
+        finally:
+            with uninterrupted():
+                shutil.rmtree(workspace, ignore_errors=True)
 
 
-def _swap(new: Path, folder: Path, spare: Path) -> None:
-    """Replaces `folder` by `new`; if that fails, `folder` is unchanged."""
+def _check_replaceable(folder: Path, overwrite: bool, kind: str, mark: str, option: str) -> None:
     if not folder.exists():
-        new.rename(folder)
         return
-    folder.rename(spare)
-    try:
-        new.rename(folder)
-    except BaseException:
-        spare.rename(folder)
-        raise
+    if not overwrite:
+        raise FileExistsError(f"{folder} exists already: choose another {option}, or pass --overwrite=true")
+    if not (folder / mark).is_file():
+        raise FileExistsError(
+            f"{folder} is no {kind}, it holds no {mark}, and will not be overwritten: choose another {option}"
+        )

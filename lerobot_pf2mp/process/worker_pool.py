@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Processes that work side by side and stop without noise."""
+"""Processes that work side by side, stop without noise, and end with the process that started them."""
 
 from __future__ import annotations
 
 import multiprocessing
+import multiprocessing.connection
+import os
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -55,7 +58,16 @@ def _start(initializer: Callable[..., None], arguments: tuple[Any, ...]) -> None
     # Ctrl-C in a terminal reaches every process; Python's own handler would print a traceback in each.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     initializer(*arguments)
+
+
+def _end_with_parent() -> None:
+    """Ends this process as soon as the one that started it has ended, however it ended."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        multiprocessing.connection.wait([parent.sentinel])
+        os._exit(1)
 
 
 def _begin() -> None:

@@ -14,6 +14,10 @@ from lerobot_pf2mp.process.atomic_files import file_written_beside
 NO_GUIDANCE = "none"
 
 
+# Of whole numbers.
+_MOST_DIGITS = 15
+
+
 @dataclass(frozen=True)
 class EpisodeRow:
     """The outcome of one episode. Numbers that an environment does not report are None.
@@ -188,4 +192,6 @@ def _parse(text: str, kind: str) -> object:
     kind = kind.removesuffix(" | None")
     if kind == "bool":
         return bool(int(text))
+    if kind == "int" and len(text) > _MOST_DIGITS:
+        raise ValueError(f"numbers must have at most {_MOST_DIGITS} digits, got {text[:40]}")
     return {"int": int, "float": float, "str": str}[kind](text)
