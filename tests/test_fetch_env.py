@@ -1028,7 +1028,9 @@ def test_the_configuration_hands_on_every_option() -> None:
     env = vector_env(config, n_envs=1)
     inner = env.envs[0].unwrapped
     assert env.call("_max_episode_steps") == (9,)
-    assert inner.spec.kwargs == {"task": "push", "render_mode": "rgb_array", **options}
+    assert inner.spec.kwargs == {
+        "env_class": "fetch.fetch_env:FetchEnv", "obs_type": "state", "task": "push", "render_mode": "rgb_array", **options
+    }  # fmt: skip
     assert inner.scene.wall_size == (0.2, 0.05, 0.08)
     env.close()
 

@@ -1316,7 +1316,13 @@ def test_the_configuration_hands_on_every_option() -> None:
     env = vector_env(PF2MPHandwritingEnv(task="HandwritingPen-v0", episode_length=9, **options), n_envs=1)
     inner = env.envs[0].unwrapped
     assert env.call("_max_episode_steps") == (9,)
-    assert inner.spec.kwargs == {"space": "pen", "render_mode": "rgb_array", **options}
+    assert inner.spec.kwargs == {
+        "env_class": "handwriting.handwriting_env:HandwritingEnv",
+        "obs_type": "state",
+        "space": "pen",
+        "render_mode": "rgb_array",
+        **options,
+    }
     assert inner.scene.name == "L"
     assert len(inner.scene.regions) == 1
     env.close()

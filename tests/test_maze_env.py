@@ -4,6 +4,7 @@ import re
 import tempfile
 import warnings
 from collections.abc import Iterator
+from contextlib import closing
 from functools import cache
 
 import gymnasium as gym
@@ -671,6 +672,8 @@ def test_the_configuration_hands_on_every_option() -> None:
     )
     env = vector_env(config, n_envs=1).envs[0].unwrapped
     assert env.spec.kwargs == {
+        "env_class": "maze.maze_env:MazeEnv",
+        "obs_type": "state",
         "maze_map": CORRIDOR,
         "control": "pd",
         "fps": 10,
@@ -791,3 +794,62 @@ def test_environments_can_be_closed_twice() -> None:
     env.reset(seed=0)
     env.close()
     env.close()
+
+
+def test_a_map_of_lists_is_that_of_its_text() -> None:
+    rows = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 1], [1, 1, 1, 1, 1]]
+    assert parse_maze_map(rows) == parse_maze_map("11111/10001/11111")
+    assert parse_maze_map(np.array(rows)) == rows
+    env = gym.make("lerobot_pf2mp/MazeLarge-v0", maze_map=rows)
+    env.reset(seed=0)
+    env.close()
+
+
+@pytest.mark.parametrize("cells", [[[1, "g"]], [[1, 2]], [1, 0], 3, None, [[1, None]], [[1.5]]])
+def test_a_map_of_other_cells_is_refused(cells: object) -> None:
+    with pytest.raises(
+        ValueError, match=r"maze_map as lists must hold rows of 0 \(free\) and 1 \(wall\), got"
+    ):
+        parse_maze_map(cells)  # type: ignore[arg-type]
+
+
+def test_cells_choose_start_and_goal_as_in_gymnasium_robotics() -> None:
+    with closing(MazeEnv("large")) as env:
+        theirs = env._maze.maze
+        for cells in (
+            {"goal_cell": (1, 1)},
+            {"reset_cell": [7, 10]},
+            {"goal_cell": (1, 1), "reset_cell": (7, 10)},
+        ):
+            observation, _ = env.reset(seed=0, options=cells)
+            for name, key in (("goal_cell", "environment_state"), ("reset_cell", "agent_pos")):
+                if name in cells:
+                    centre = theirs.cell_rowcol_to_xy(np.array(cells[name]))
+                    assert (np.abs(observation[key] - centre) <= 0.25).all()
+
+
+@pytest.mark.parametrize("cell", [(0, 0), (-1, 1), (99, 1), (1, 1, 1), "ab", (1.0, 1.0), 3])
+@pytest.mark.parametrize("name", ["goal_cell", "reset_cell"])
+def test_a_cell_that_is_not_free_is_refused(name: str, cell: object) -> None:
+    with (
+        closing(MazeEnv("large")) as env,
+        pytest.raises(ValueError, match=f"{name} must be the row and column"),
+    ):
+        env.reset(options={name: cell})
+
+
+def test_gymnasium_makes_what_lerobots_configuration_makes() -> None:
+    env = gym.make("lerobot_pf2mp/MazeUMaze-v0", obs_type="pixels_agent_pos", render_size=64)
+    observation, _ = env.reset(seed=3)
+    config = PF2MPMazeEnv(task="MazeUMaze-v0", obs_type="pixels_agent_pos", render_size=64)
+    (vector_env,) = next(iter(config.create_envs(1).values())).values()
+    expected, _ = vector_env.reset(seed=[3])
+    assert set(observation) == {"agent_pos", "pixels"}
+    for key, value in observation.items():
+        assert np.array_equal(value, expected[key][0])
+    for one in (env, vector_env):
+        one.close()
+    with pytest.raises(
+        ValueError, match=r"obs_type must be one of \['state', 'pixels_agent_pos'\], got 'pixels'"
+    ):
+        gym.make("lerobot_pf2mp/MazeUMaze-v0", obs_type="pixels")

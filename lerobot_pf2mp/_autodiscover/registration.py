@@ -50,7 +50,7 @@ def register_gym_environments() -> None:
 
     from lerobot_pf2mp.envs import tasks
 
-    entry_points = {
+    env_classes = {
         "maze.maze_env:MazeEnv": ("maze_map", tasks.MAZE_TASKS, tasks.MAZE_STEPS),
         "fetch.fetch_env:FetchEnv": ("task", tasks.FETCH_TASKS, tasks.FETCH_STEPS),
         "handwriting.handwriting_env:HandwritingEnv": (
@@ -59,14 +59,14 @@ def register_gym_environments() -> None:
             tasks.HANDWRITING_STEPS,
         ),
     }
-    for entry_point, (argument, names, max_episode_steps) in entry_points.items():
+    for env_class, (argument, names, max_episode_steps) in env_classes.items():
         for name, value in names.items():
             if f"{PACKAGE}/{name}" not in gymnasium.registry:
                 gymnasium.register(
                     id=f"{PACKAGE}/{name}",
-                    entry_point=f"{PACKAGE}.envs.{entry_point}",
+                    entry_point=f"{PACKAGE}.envs.observed_env:make_observed_env",
                     max_episode_steps=max_episode_steps,
-                    kwargs={argument: value},
+                    kwargs={"env_class": env_class, argument: value},
                 )
 
 

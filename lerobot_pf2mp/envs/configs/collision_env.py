@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import gymnasium as gym
-from gymnasium.wrappers import AddRenderObservation, FilterObservation
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import freeze_after_episode_end
@@ -55,10 +54,9 @@ class CollisionEnvConfig(EnvConfig):
             gym.make,
             f"lerobot_pf2mp:{self.gym_id}",
             disable_env_checker=self.disable_env_checker,
+            obs_type=self.obs_type,
             **self.gym_kwargs,
         )
-        if self.obs_type == "pixels_agent_pos":
-            make_env = partial(_with_pixels, make_env)
         env_fns = [freeze_after_episode_end(make_env)] * n_envs
         env: gym.vector.VectorEnv
         autoreset_mode = gym.vector.AutoresetMode.NEXT_STEP
@@ -93,7 +91,3 @@ class CollisionEnvConfig(EnvConfig):
         elif environment_dim:
             shape = (environment_dim,)
             self.features["environment_state"] = PolicyFeature(type=FeatureType.ENV, shape=shape)
-
-
-def _with_pixels(make_env: Callable[[], gym.Env]) -> gym.Env:
-    return FilterObservation(AddRenderObservation(make_env(), render_only=False), ["agent_pos", "pixels"])

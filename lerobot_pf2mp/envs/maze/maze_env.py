@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -43,7 +44,8 @@ class MazeEnv(gym.Env):
 
     ## Starting state
     PointMaze's: start and goal in different free cells, each up to 0.25 m off the centre on both axes. ``reset(options=
-    {"start": (x, y), "goal": (x, y)})`` sets them [m].
+    {"start": (x, y), "goal": (x, y)})`` sets them [m]; ``reset_cell`` and ``goal_cell``, row and column in the map,
+    choose the cells, as in gymnasium-robotics.
 
     ## Episode end
     After the registered number of steps; at the goal too with `terminate_on_success`. A collision does not end it.
@@ -67,7 +69,7 @@ class MazeEnv(gym.Env):
 
     def __init__(
         self,
-        maze_map: str = "large",
+        maze_map: str | Sequence[Sequence[int]] = "large",
         control: str = "exact",
         collision_radius: float = BALL_RADIUS,
         fps: int = 10,
@@ -84,7 +86,7 @@ class MazeEnv(gym.Env):
                 f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}"
             )
         self.render_mode = render_mode
-        self.task = f"maze-{maze_map}" if maze_map in MAZE_MAPS else "maze"
+        self.task = f"maze-{maze_map}" if isinstance(maze_map, str) and maze_map in MAZE_MAPS else "maze"
         self._control = control
         self._collision_radius = collision_radius
         self._terminate_on_success = terminate_on_success
@@ -117,8 +119,9 @@ class MazeEnv(gym.Env):
             ValueError: If the start or goal in `options` is in a wall or outside the map.
         """
         super().reset(seed=seed)
-        self._maze.reset(seed=seed)
         options = options or {}
+        cells = {name: self._free_cell(options, name) for name in ("reset_cell", "goal_cell")}
+        self._maze.reset(seed=seed, options=cells if any(cells.values()) else None)
         if options.get("goal") is not None:
             self._maze.goal = self._free_position(options["goal"], "goal")
         if options.get("start") is not None:
@@ -185,6 +188,23 @@ class MazeEnv(gym.Env):
             step_physics(self._maze.model, self._maze.data, reference, line_velocity)
             path.append(self._position)
         return path
+
+    def _free_cell(self, options: dict[str, Any], name: str) -> tuple[int, int] | None:
+        cell = options.get(name)
+        if cell is None:
+            return None
+        cells = np.array(self._maze.maze.maze_map)
+        row_column = np.asarray(cell)
+        is_inside = (
+            row_column.shape == (2,)
+            and np.issubdtype(row_column.dtype, np.integer)
+            and bool(((row_column >= 0) & (row_column < cells.shape)).all())
+        )
+        if not is_inside or cells[tuple(row_column)] == 1:
+            raise ValueError(
+                f"{name} must be the row and column of a free cell in a map of {cells.shape}, got {cell!r}"
+            )
+        return int(row_column[0]), int(row_column[1])
 
     def _free_position(self, position: Any, name: str) -> np.ndarray:
         position = np.asarray(position, dtype=np.float64)

@@ -6,7 +6,9 @@ from __future__ import annotations
 import contextlib
 import io
 from collections.abc import Sequence
+from numbers import Integral
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -24,11 +26,12 @@ VELOCITY_GAIN = 1.0
 MAX_SPEED = 5.0  # [m/s] for each axis, PointMaze's own limit
 
 
-def parse_maze_map(text: str) -> list[list[int]]:
+def parse_maze_map(text: str | Sequence[Sequence[int]]) -> list[list[int]]:
     """The rows of a maze map, 1 for a wall and 0 for a free cell.
 
     Args:
-        text: The name of one of `MAZE_MAPS`, or rows of 0 and 1 separated by "/", for example ``11111/10001/11111``.
+        text: The name of one of `MAZE_MAPS`, or rows of 0 and 1 separated by "/", for example ``11111/10001/11111``, or
+            the same as lists of numbers, as gymnasium-robotics has them.
 
     Returns:
         The rows, north first.
@@ -36,6 +39,8 @@ def parse_maze_map(text: str) -> list[list[int]]:
     Raises:
         ValueError: If the map is not a closed rectangle of 0 and 1 whose free cells, two at least, are connected.
     """
+    if not isinstance(text, str):
+        text = "/".join("".join(map(str, row)) for row in _rows_of(text))
     if text in MAZE_MAPS:
         return [list(row) for row in MAZE_MAPS[text]]
     lines = [line for line in str(text).replace("\n", "/").replace(" ", "").split("/") if line]
@@ -65,7 +70,21 @@ def parse_maze_map(text: str) -> list[list[int]]:
     return rows
 
 
-def make_point_maze(maze_map: str) -> tuple[PointMazeEnv, mujoco.MjSpec]:
+def _rows_of(cells: Any) -> list[list[int]]:
+    try:
+        rows = [list(row) for row in cells]
+    except TypeError:
+        rows = [[None]]
+    # gymnasium-robotics marks cells for the start and the goal by r, g and c.
+    if not all(isinstance(cell, Integral) and cell in (0, 1) for row in rows for cell in row):
+        raise ValueError(
+            f"maze_map as lists must hold rows of 0 (free) and 1 (wall), got {cells!r}; reset(options={{'reset_cell': ..., "
+            "'goal_cell': ...}) chooses the cells of start and goal"
+        )
+    return rows
+
+
+def make_point_maze(maze_map: str | Sequence[Sequence[int]]) -> tuple[PointMazeEnv, mujoco.MjSpec]:
     """Makes the PointMaze of a map, and the specification of its MuJoCo model.
 
     Args:
