@@ -1,5 +1,5 @@
 # Every target sets up .venv by itself; a second call starts at once.
-.PHONY: demo test test-fast check bench tables clean
+.PHONY: demo test test-fast check fuzz bench tables clean
 
 demo: .venv/installed
 	.venv/bin/pf2mp-demo --output_dir=demo
@@ -15,6 +15,9 @@ check: .venv/installed
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
+
+fuzz: .venv/installed
+	.venv/bin/python tests/fuzzing
 
 bench: .venv-bench/installed
 	.venv-bench/bin/python tests/benchmarks
