@@ -48,7 +48,7 @@ def check_kinds_and_sizes(config: Any) -> None:
                 raise ValueError(f"{name} must be {_described(kinds)}, got null")
             continue
         for item in value if isinstance(value, list | tuple) else (value,):
-            if not any(_is_of(item, kind) for kind in kinds):
+            if not any(_is_of(item, kind) for kind in kinds - {type(None)}):
                 raise ValueError(f"{name} must be {_described(kinds)}, got {value!r}")
             if name in LARGEST and item > LARGEST[name]:
                 raise ValueError(f"{name} must be at most {LARGEST[name]}, got {value}")
