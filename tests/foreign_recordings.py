@@ -14,6 +14,7 @@ from lerobot_pf2mp.dataset_tools.maze.maze_expert import MazeExpert
 from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory
 from lerobot_pf2mp.envs.maze.point_maze import parse_maze_map
 
+OPEN = "1111111/1000001/1000001/1000001/1111111"  # D4RL's maze2d-open
 FOREIGN_LAYOUT = "observations and infos/goal"
 
 

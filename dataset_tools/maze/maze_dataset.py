@@ -19,6 +19,10 @@ from lerobot_pf2mp.envs.maze.swept_ball import SweptBall
 from lerobot_pf2mp.envs.tasks import MAZE_OF_TASK
 
 FPS = 10
+GOAL_RADIUS = (
+    0.5  # largest distance from its goal at which a demonstration may end, D4RL's and PointMaze's [m]
+)
+_LONGEST_STEP = 1.0  # a longer step is no motion, but where two recordings meet [m]
 TASK_DESCRIPTION = "Move the ball to the red goal without touching a wall."
 
 _FEATURES = {
@@ -103,6 +107,8 @@ def write_maze_dataset(
         The number of episodes written, and the number of those left out, by reason.
     """
     point_maze, model = make_point_maze(maze)
+    left_out: Counter[str] = Counter()
+    trajectories = _whole(trajectories, left_out)
     features: dict[str, Any] = dict(_FEATURES)
     if image_width is not None:
         image = MazeImage(point_maze.maze.maze_map, image_width)
@@ -116,7 +122,7 @@ def write_maze_dataset(
         fps=FPS,
         surroundings=_IMAGES if image_width else _GOAL,
     )
-    return write_trajectories(
+    n_written, dropped = write_trajectories(
         trajectories,
         root=root,
         spec=DatasetSpec(repo_id, FPS, features, TASK_DESCRIPTION, card),
@@ -126,6 +132,20 @@ def write_maze_dataset(
         n_expected=n_expected,
         overwrite=overwrite,
     )
+    return n_written, dropped + left_out
+
+
+def _whole(trajectories: Iterable[Trajectory], left_out: Counter[str]) -> Iterator[Trajectory]:
+    """The trajectories that lead to their goal in one piece; counts the others."""
+    for trajectory in trajectories:
+        assert trajectory.goal is not None  # there is one in every maze
+        steps = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
+        if (steps > _LONGEST_STEP).any():
+            left_out["with a jump"] += 1
+        elif np.linalg.norm(trajectory.positions[-1] - trajectory.goal) > GOAL_RADIUS:
+            left_out["far from their goal"] += 1
+        else:
+            yield trajectory
 
 
 def _with_images(trajectories: Iterable[Trajectory], image: MazeImage, n_steps: int) -> Iterator[Trajectory]:
