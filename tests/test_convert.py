@@ -264,7 +264,7 @@ def test_d4rl_files_recorded_in_no_known_maze_are_refused(tmp_path: Path) -> Non
     corridor = "11111111111/10000000001/11111111111"
     path = write_d4rl(tmp_path / "maze2d.hdf5", demonstrations(corridor, 6), corridor, with_timeouts=True)
     with pytest.raises(ValueError, match="the maze that fits: none that is known"):
-        read_d4rl(path, "large")
+        read_d4rl(path, "umaze")
 
 
 @pytest.mark.parametrize("column", ["terminals", "timeouts"])

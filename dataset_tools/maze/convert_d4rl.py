@@ -28,8 +28,8 @@ _SLICE_ROWS = 2**16  # rows that are read at a time
 def read_d4rl(path: Path, maze: str) -> tuple[int, Iterator[Trajectory]]:
     """Reads the start-goal trajectories of a D4RL maze2d file, in the coordinates of this package's environment.
 
-    A trajectory ends where ``timeouts`` or ``terminals`` is true, and where the recorded goal changes. Either of these columns
-    may be missing, or false everywhere. If there is one goal in the whole file, it says nothing about a trajectory that ends
+    A trajectory ends where ``timeouts`` or ``terminals`` is true, and where the recorded goal changes. Either column may be
+    missing, or false everywhere. If there is one goal in the whole file, it says nothing about a trajectory that ends
     elsewhere: then the goal is where that trajectory ends. The file is read in slices: apart from a few numbers per
     trajectory, memory does not grow with its length.
 
