@@ -19,14 +19,19 @@ class SourceConfig:
     """The source of recorded demonstrations."""
 
     # Layout of the recording: d4rl (maze2d, one HDF5 file), minari (pointmaze, a folder), fetch (gymnasium-robotics'
-    # FetchReach or FetchPush: an npz file, or the folder of a Minari dataset) or handwriting (a CSV or JSON file, or the
-    # folder of a LeRobotDataset with joint actions).
+    # FetchReach or FetchPush: an npz file, or the folder of a Minari dataset) or handwriting (a CSV, TSV, JSON or JSONL
+    # file, or the folder of a LeRobotDataset with joint actions).
     type: str = "d4rl"
     # The file or folder.
     path: Path | None = None
     # Handwriting: seven angles to add to the recorded joints [rad], if the arm has other zero positions:
     # [0,0,0,0,0,-1.5708,-0.7854] for a real Panda.
     joint_offsets: list[float] = field(default_factory=list)
+    # Handwriting: length of the unit in which positions of the pen were recorded [m]: 0.001 for millimetres.
+    scale: float = 1.0
+    # Handwriting: where x = y = 0 of the recorded positions of the pen lies in the frame of the arm's base [m], for example
+    # [0.34,-0.16], the sheet's corner on the right of the arm. By default the recording is in that frame already.
+    place: list[float] | None = None
 
 
 @dataclass
@@ -41,6 +46,8 @@ class ConvertConfig(WritingConfig):
         pf2mp-convert --source.type=fetch --source.path=~/.minari/datasets/fetch/push-v0 --task=fetch_push \
 --scene.wall_position=[1.30,0.80] --root=data/push
         pf2mp-convert --source.type=handwriting --source.path=strokes.csv --task=handwriting_pen --root=data/mine
+        pf2mp-convert --source.type=handwriting --source.path=tablet.csv --source.scale=0.001 --source.place=[0.34,-0.16] \
+--task=handwriting_joint --root=data/tablet
         pf2mp-convert --source.type=handwriting --source.path=data/teleoperated --task=handwriting_joint \
 --scene_file=my_stroke.json --root=data/mine
 
@@ -51,8 +58,17 @@ class ConvertConfig(WritingConfig):
     episode is its goal. Episodes that do not end within 0.05 m of it are left out.
 
     CSV files of handwriting have columns time [s], optionally episode, and joint_1 to joint_7 [rad], optionally finger_1
-    and finger_2 [m], or x and y of the pen [m]. JSON files are {"episodes": [{"time": [...], "joints": [[7 or 9], ...]}]} or
-    "pen": [[x, y], ...] instead. Of a LeRobotDataset the actions are used: 7 joints, or 7 joints and 2 fingers.
+    and finger_2 [m], or x and y of the pen [m]. Other usual names are understood (timestamp, %time, t; panda_joint1, joint1,
+    q1), and semicolons, tabs and decimal commas. JSON files are {"episodes": [{"time": [...], "joints": [[7 or 9], ...]}]}
+    or "pen": [[x, y], ...] instead; JSONL files have such an episode, or a sample {"time": 0.1, "x": 0.5, "y": 0.1}, in each
+    line. Of a LeRobotDataset the actions are used, by their names: 7 joints, or 7 joints and 2 fingers.
+
+    A demonstration of handwriting is one stroke. Columns pen_down, pen_up, pressure or z (height of the pen above the table)
+    tell where the pen is lifted: what comes before the stroke and after it is left out, and so are episodes in which the pen
+    is lifted in between, in which the times do not increase, or with fewer than 3 samples.
+
+    A D4RL trajectory ends where timeouts or terminals say so or the goal changes. Trajectories of a maze that end more than
+    0.5 m from their goal, cut off, are left out. A recording in another maze is refused.
     """
 
     # The recording.
@@ -150,6 +166,8 @@ def _convert_handwriting(config: ConvertConfig, path: Path) -> None:
         SPACE_OF_TASK[config.task],
         scene_options=config.scene_options,
         joint_offsets=config.source.joint_offsets,
+        scale=config.source.scale,
+        place=config.source.place,
         n_episodes=config.n_episodes,
     )
     write_and_report(config, config.task, HANDWRITING_STEPS, write)
