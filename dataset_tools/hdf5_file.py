@@ -45,17 +45,19 @@ def array_in(group: h5py.Group, name: str, path: Path) -> h5py.Dataset:
     Raises:
         ValueError: If there is something else under this name, or much less is stored than the array's shape says.
     """
-    entry = _entry(group, name)
+    entry, full_name = _entry(group, name), f"{group.name}/{name}".strip("/")
     if isinstance(entry, str):
         raise ValueError(
-            f"{name} must be an array of real numbers that the file itself holds, got {entry} in {path}"
+            f"{full_name} must be an array of real numbers that the file itself holds, got {entry} in {path}"
         )
-    check_size(name, entry.shape, entry.nbytes, entry.id.get_storage_size(), path)
+    check_size(full_name, entry.shape, entry.nbytes, entry.id.get_storage_size(), path)
     return entry
 
 
 def _entry(group: h5py.Group, name: str) -> h5py.Dataset | str:
     """What is under a name: an array of numbers, or the words for anything else."""
+    if not holds(group, name):
+        return "nothing"
     if isinstance(group.get(name, getlink=True), h5py.ExternalLink):
         return "a link to another file"
     try:

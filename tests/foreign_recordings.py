@@ -105,11 +105,12 @@ def write_pointmaze(
         }
     )
     observations = []
-    stale = trajectories[0].goal
+    stale = np.atleast_2d(trajectories[0].goal)[0]
     for trajectory in trajectories:
-        goals = np.tile(trajectory.goal, (len(trajectory.positions), 1))
+        # One goal, or one for each position.
+        goals = np.array(np.broadcast_to(trajectory.goal, (len(trajectory.positions), n_dims)))
         goals[0] = stale
-        stale = trajectory.goal
+        stale = goals[-1]
         observations.append(
             {
                 "observation": np.zeros((len(goals), 4)),

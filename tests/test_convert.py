@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+import json
 import shutil
 import tracemalloc
 from collections.abc import Callable
@@ -13,9 +14,11 @@ from lerobot.datasets import LeRobotDataset
 
 from lerobot_pf2mp.dataset_tools.maze import convert_d4rl
 from lerobot_pf2mp.dataset_tools.maze.convert_d4rl import read_d4rl
-from lerobot_pf2mp.dataset_tools.maze.convert_minari import read_minari
+from lerobot_pf2mp.dataset_tools.maze.convert_minari import read_minari, recorded_maze
 from lerobot_pf2mp.dataset_tools.maze.maze_dataset import write_maze_dataset
+from lerobot_pf2mp.dataset_tools.maze.maze_recognition import maze_of_recording
 from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory, resample
+from lerobot_pf2mp.envs.maze.point_maze import parse_maze_map
 
 LOPSIDED = (
     "1111111/1000001/1111101/1110001/1111111"  # tells rows from columns, north from south, east from west
@@ -429,6 +432,122 @@ def test_colliding_and_short_trajectories_of_minari_are_left_out_and_counted(
     dataset = LeRobotDataset("a/b", root=tmp_path / "d")
     goals = [dataset[40 * number]["observation.environment_state"] for number in range(3)]
     np.testing.assert_allclose(goals, [trajectory.goal for trajectory in good], rtol=1e-6)
+
+
+def one_episode(*trajectories: Trajectory) -> Trajectory:
+    """An episode of a continuing task: the goal is a new one whenever the ball has reached it."""
+    goals = [np.tile(each.goal, (len(each.positions), 1)) for each in trajectories]
+    return Trajectory(np.concatenate([each.positions for each in trajectories]), np.concatenate(goals))
+
+
+def test_episodes_of_minari_are_split_where_the_goal_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = demonstrations(OPEN, 6)
+    cut_off = Trajectory(expected[5].positions[: len(expected[5].positions) // 3], expected[5].goal)
+    episodes = [one_episode(*expected[:3]), one_episode(*expected[3:5], cut_off)]
+    folder = write_pointmaze(tmp_path, monkeypatch, episodes)
+    n_episodes, trajectories = read_minari(folder)
+    assert n_episodes == 2
+    assert_same(list(trajectories), [*expected[:5], cut_off], atol=1e-12)
+    options = {"root": tmp_path / "d", "repo_id": "a/b", "maze": OPEN, "origin": "", "n_steps": 80}
+    assert write_maze_dataset(read_minari(folder)[1], **options) == (5, {"far from their goal": 1})
+
+
+def with_env_spec(folder: Path, spec: dict) -> Path:
+    path = folder / "data" / "metadata.json"
+    common = {"entry_point": "gymnasium_robotics.envs.maze.point_maze:PointMazeEnv", "max_episode_steps": 600}
+    metadata = {
+        **json.loads(path.read_text()),
+        "env_spec": json.dumps({"id": "PointMaze-v3", **common, **spec}),
+    }
+    path.write_text(json.dumps(metadata))
+    return folder
+
+
+def test_the_maze_of_a_minari_dataset_is_the_one_it_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_pointmaze(tmp_path, monkeypatch, demonstrations(OPEN, 3))
+    assert recorded_maze(folder) is None
+    rows = [[int(cell) for cell in row] for row in OPEN.split("/")]
+    rows[1][1], rows[3][5] = "r", "g"
+    assert recorded_maze(with_env_spec(folder, {"kwargs": {"maze_map": rows}})) == OPEN
+    for spec in ({}, {"kwargs": {}}, {"kwargs": {"maze_map": 3}}, {"kwargs": []}):
+        assert recorded_maze(with_env_spec(folder, spec)) is None
+
+
+def test_a_maze_that_no_task_has_takes_the_place_of_the_task_s() -> None:
+    assert maze_of_recording(OPEN, "large", False, Path("a")) == OPEN
+    large = "/".join("".join(map(str, row)) for row in parse_maze_map("large"))
+    assert maze_of_recording(large, "large", False, Path("a")) == "large"
+    with pytest.raises(
+        ValueError, match="maze that is chosen, umaze, got a, which was made in that of --task=maze_large"
+    ):
+        maze_of_recording(large, "umaze", False, Path("a"))
+    with pytest.raises(ValueError, match=f"made in that of --maze_map={OPEN}"):
+        maze_of_recording(OPEN, LOPSIDED, True, Path("a"))
+
+
+def test_minari_datasets_of_another_maze_are_refused_naming_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_pointmaze(tmp_path, monkeypatch, demonstrations("medium", 5))
+    assert read_minari(folder, "medium")[0] == 5
+    with pytest.raises(ValueError, match="in its walls or outside; the maze that fits: --task=maze_medium"):
+        read_minari(folder, "large")
+
+
+def test_minari_datasets_of_an_ant_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = write_pointmaze(tmp_path, monkeypatch, demonstrations("umaze", 2))
+    ant = {"id": "AntMaze_UMaze-v4", "entry_point": "gymnasium_robotics.envs.maze.ant_maze_v4:AntMazeEnv"}
+    with pytest.raises(ValueError, match=r"must hold PointMaze episodes, got AntMaze \(AntMaze_UMaze-v4\)"):
+        read_minari(with_env_spec(folder, ant))
+
+
+def test_incomplete_and_old_minari_datasets_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_pointmaze(tmp_path, monkeypatch, demonstrations("umaze", 3))
+    path = folder / "data" / "main_data.hdf5"
+    with h5py.File(path, "a") as file:
+        del file["episode_1/rewards"]
+    with pytest.raises(ValueError, match="episode_1/rewards must be an array .* got nothing in"):
+        read_minari(folder)
+    with h5py.File(path, "a") as file:
+        del file["episode_1"]
+    with pytest.raises(
+        ValueError, match="the 3 episodes that its metadata.json promises, got 2, without episode_1"
+    ):
+        read_minari(folder)
+    metadata = folder / "data" / "metadata.json"
+    content = json.loads(metadata.read_text())
+    metadata.write_text(json.dumps({**content, "observation_space": None} | {"env_spec": "{}"}))
+    with pytest.raises(ValueError, match="must hold a Minari dataset, got one that cannot be read"):
+        read_minari(folder)
+    metadata.write_text(json.dumps({name: content[name] for name in content if name != "action_space"}))
+    with pytest.raises(ValueError, match=r"cannot be read: its metadata\.json holds no action_space"):
+        read_minari(folder)
+    metadata.unlink()
+    with pytest.raises(
+        ValueError, match=r"holds no metadata\.json: Minari before 0\.5 wrote it, or its copy is"
+    ):
+        read_minari(folder)
+
+
+@pytest.mark.parametrize("name", ["observations/achieved_goal", "observations/desired_goal", "rewards"])
+@pytest.mark.parametrize(
+    "put", [a_link_that_leads_nowhere, a_group, references, pairs, terabytes, virtual, one_number]
+)
+def test_whatever_is_no_array_in_a_minari_file_is_refused_before_it_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, put: Callable[[h5py.File, str], None], name: str
+) -> None:
+    folder = write_pointmaze(tmp_path, monkeypatch, demonstrations("umaze", 2))
+    with h5py.File(folder / "data" / "main_data.hdf5", "a") as file:
+        del file[f"episode_1/{name}"]
+        put(file, f"episode_1/{name}")
+    with pytest.raises(ValueError, match=f"episode_1/{name} must be .* in {folder}"):
+        read_minari(folder)
 
 
 def test_a_missing_minari_folder_is_named(tmp_path: Path) -> None:

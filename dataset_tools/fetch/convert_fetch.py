@@ -33,7 +33,7 @@ import numpy as np
 
 from lerobot_pf2mp.dataset_tools.fetch.fetch_dataset import fetch_spec
 from lerobot_pf2mp.dataset_tools.npz_file import read_npz
-from lerobot_pf2mp.dataset_tools.open_minari import open_minari
+from lerobot_pf2mp.dataset_tools.open_minari import episodes_in, open_minari
 from lerobot_pf2mp.dataset_tools.writing.episodes import MIN_STEPS, Trajectory, resample
 from lerobot_pf2mp.dataset_tools.writing.write_trajectories import write_trajectories
 from lerobot_pf2mp.envs.box import Box
@@ -229,7 +229,7 @@ def _read_minari(path: Path) -> tuple[int, Iterator[dict[str, np.ndarray]]]:
 
 
 def _observations(dataset: Any, path: Path) -> Iterator[dict[str, np.ndarray]]:
-    for episode in dataset.iterate_episodes():
+    for episode in episodes_in(dataset, path):
         observations = episode.observations
         if not isinstance(observations, dict) or not set(_COLUMNS) <= set(observations):
             raise ValueError(

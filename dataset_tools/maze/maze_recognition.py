@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_pf2mp.envs.maze.point_maze import MAZE_MAPS, parse_maze_map
+from lerobot_pf2mp.envs.maze.point_maze import parse_maze_map
 from lerobot_pf2mp.envs.tasks import MAZE_OF_TASK
 
 _OPEN = "1111111/1000001/1000001/1000001/1111111"  # D4RL's maze2d-open
@@ -53,23 +53,27 @@ def check_maze(positions_in: Callable[[_Rows], Iterable[np.ndarray]], maze: str,
     )
 
 
-def option_for(maze: str) -> str:
-    """The command-line option that chooses a maze, for example ``--task=maze_large``."""
-    rows = parse_maze_map(maze)
-    as_text = "/".join("".join(map(str, row)) for row in map(_walls, rows))
-    return next(
-        (option for option, known in _KNOWN.items() if same_maze(known, maze)), f"--maze_map={as_text}"
+def maze_of_recording(recorded: str, chosen: str, is_own: bool, path: Path) -> str:
+    """The maze of a recording that says in which maze it was made.
+
+    Args:
+        recorded: That maze, as for `parse_maze_map`.
+        chosen: The maze that the user chose.
+        is_own: Whether it is a map of the user's own, and not that of a task.
+        path: The recording, for the error message.
+
+    Raises:
+        ValueError: If the recording was made in another maze. A task's maze gives way to one that no task has.
+    """
+    if _walls(recorded) == _walls(chosen):
+        return chosen
+    task = next((task for task, maze in MAZE_OF_TASK.items() if _walls(maze) == _walls(recorded)), None)
+    if task is None and not is_own:
+        return recorded
+    option = f"--maze_map={recorded}" if task is None else f"--task={task}"
+    raise ValueError(
+        f"a recording must come from the maze that is chosen, {chosen}, got {path}, which was made in that of {option}"
     )
-
-
-def same_maze(maze: str, other: str) -> bool:
-    """Whether two mazes, as for `parse_maze_map`, have the same walls."""
-    return [_walls(row) for row in parse_maze_map(maze)] == [_walls(row) for row in parse_maze_map(other)]
-
-
-def is_known(maze: str) -> bool:
-    """Whether a maze is that of a task."""
-    return any(same_maze(known, maze) for known in MAZE_MAPS)
 
 
 def _share_in_walls(parts: Iterable[np.ndarray], rows: _Rows) -> float:
@@ -86,8 +90,8 @@ def _share_in_walls(parts: Iterable[np.ndarray], rows: _Rows) -> float:
     return 1 - n_free / n if n else 0.0
 
 
-def _walls(row: list[int]) -> list[int]:
-    return [int(cell == 1) for cell in row]
+def _walls(maze: str) -> list[list[bool]]:
+    return [[cell == 1 for cell in row] for row in parse_maze_map(maze)]
 
 
 def _n_free(rows: _Rows) -> int:

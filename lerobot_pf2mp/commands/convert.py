@@ -11,7 +11,14 @@ from lerobot_pf2mp.commands.command import write_and_report
 from lerobot_pf2mp.commands.publishing import published_if_asked
 from lerobot_pf2mp.commands.scene import SceneConfig
 from lerobot_pf2mp.commands.writing import WritingConfig
-from lerobot_pf2mp.envs.tasks import FETCH_OF_TASK, FETCH_STEPS, HANDWRITING_STEPS, MAZE_STEPS, SPACE_OF_TASK
+from lerobot_pf2mp.envs.tasks import (
+    FETCH_OF_TASK,
+    FETCH_STEPS,
+    HANDWRITING_STEPS,
+    MAZE_OF_TASK,
+    MAZE_STEPS,
+    SPACE_OF_TASK,
+)
 
 
 @dataclass
@@ -67,8 +74,9 @@ class ConvertConfig(WritingConfig):
     tell where the pen is lifted: what comes before the stroke and after it is left out, and so are episodes in which the pen
     is lifted in between, in which the times do not increase, or with fewer than 3 samples.
 
-    A D4RL trajectory ends where timeouts or terminals say so or the goal changes. Trajectories of a maze that end more than
-    0.5 m from their goal, cut off, are left out. A recording in another maze is refused.
+    Trajectories of a maze end where timeouts or terminals of D4RL say so, and where the goal changes. Those that end more
+    than 0.5 m from their goal, cut off, are left out. A recording in another maze is refused; a maze that no task has is taken
+    from a Minari dataset that names it.
     """
 
     # The recording.
@@ -124,11 +132,18 @@ def _convert_maze(config: ConvertConfig, path: Path) -> None:
                 f"--source.type must be {source_type} for {config.task}, got {config.source.type!r}"
             )
     from lerobot_pf2mp.dataset_tools.maze.convert_d4rl import read_d4rl
-    from lerobot_pf2mp.dataset_tools.maze.convert_minari import read_minari
+    from lerobot_pf2mp.dataset_tools.maze.convert_minari import read_minari, recorded_maze
     from lerobot_pf2mp.dataset_tools.maze.maze_dataset import maze_of, write_maze_dataset
+    from lerobot_pf2mp.dataset_tools.maze.maze_recognition import maze_of_recording
 
-    maze = maze_of(config.task, config.maze_map)
-    n_expected, trajectories = read_d4rl(path, maze) if config.source.type == "d4rl" else read_minari(path)
+    chosen = maze = maze_of(config.task, config.maze_map)
+    if config.source.type == "d4rl":
+        n_expected, trajectories = read_d4rl(path, maze)
+    elif (recorded := recorded_maze(path)) is None:
+        n_expected, trajectories = read_minari(path, maze)
+    else:
+        maze = maze_of_recording(recorded, chosen, config.maze_map is not None, path)
+        n_expected, trajectories = read_minari(path)
     write = partial(
         write_maze_dataset,
         trajectories,
@@ -137,7 +152,7 @@ def _convert_maze(config: ConvertConfig, path: Path) -> None:
         n_episodes=config.n_episodes,
         n_expected=n_expected,
     )
-    write_and_report(config, "maze" if config.maze_map else config.task, MAZE_STEPS, write)
+    write_and_report(config, config.task if maze in MAZE_OF_TASK.values() else "maze", MAZE_STEPS, write)
 
 
 def _convert_fetch(config: ConvertConfig, path: Path) -> None:
