@@ -24,8 +24,8 @@ _N_COMPARED = 50  # episodes by which another maze is recognised
 def read_minari(path: Path, maze: str | None = None) -> tuple[int, Iterator[Trajectory]]:
     """Reads the trajectories of a Minari PointMaze dataset. Its coordinates are those of this package.
 
-    An episode in which the goal changes, as in continuing tasks, is as many trajectories as there are goals. The last of them
-    may be cut off, far from its goal.
+    An episode in which the goal changes, as in continuing tasks, is one trajectory for each goal. The last of them may be cut
+    off, far from its goal.
 
     Args:
         path: The dataset's folder, for example ``~/.minari/datasets/D4RL/pointmaze/large-v2``.

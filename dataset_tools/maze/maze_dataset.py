@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_pf2mp.dataset_tools.writing.card import card_header
 from lerobot_pf2mp.dataset_tools.writing.episodes import IMAGE_KEY, Trajectory, resample
 from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, image_feature
 from lerobot_pf2mp.dataset_tools.writing.write_trajectories import write_trajectories
@@ -18,10 +19,9 @@ from lerobot_pf2mp.envs.maze.point_maze import BALL_RADIUS, make_point_maze
 from lerobot_pf2mp.envs.maze.swept_ball import SweptBall
 from lerobot_pf2mp.envs.tasks import MAZE_OF_TASK
 
+ROBOT = "point_maze"
 FPS = 10
-GOAL_RADIUS = (
-    0.5  # largest distance from its goal at which a demonstration may end, D4RL's and PointMaze's [m]
-)
+GOAL_RADIUS = 0.5  # largest distance from its goal at which a demonstration may end [m]
 _LONGEST_STEP = 1.0  # a longer step is no motion, but where two recordings meet [m]
 TASK_DESCRIPTION = "Move the ball to the red goal without touching a wall."
 
@@ -34,12 +34,7 @@ _FEATURES = {
 _GOAL = "| `observation.environment_state` | position x, y of the goal | m |"
 _IMAGES = "| `observation.image` | the maze from above | |"
 _CARD = """\
----
-license: apache-2.0
-task_categories: [robotics]
-tags: [LeRobot, pf2mp, maze]
----
-# {title}
+{header}# {title}
 
 Start-goal trajectories of a ball in a maze, none of which touches a wall. {origin}
 
@@ -116,6 +111,7 @@ def write_maze_dataset(
         del features["observation.environment_state"]
         features[IMAGE_KEY] = image_feature(image.size)
     card = _CARD.format(
+        header=card_header("maze"),
         title=repo_id,
         origin=origin,
         n_steps=n_steps,
@@ -125,7 +121,7 @@ def write_maze_dataset(
     n_written, dropped = write_trajectories(
         trajectories,
         root=root,
-        spec=DatasetSpec(repo_id, FPS, features, TASK_DESCRIPTION, card),
+        spec=DatasetSpec(repo_id, FPS, features, TASK_DESCRIPTION, card, ROBOT),
         n_steps=n_steps,
         collides=SweptBall(model, BALL_RADIUS).collides,
         n_episodes=n_episodes,

@@ -27,7 +27,12 @@ def write_video_dataset(
     """
     with written_beside(root, overwrite, kind="dataset", mark="meta/info.json", option="--root") as partial:
         dataset = LeRobotDataset.create(
-            spec.repo_id, spec.fps, spec.features, root=partial, streaming_encoding=True
+            spec.repo_id,
+            spec.fps,
+            spec.features,
+            robot_type=spec.robot_type,
+            root=partial,
+            streaming_encoding=True,
         )
         n_written = 0
         try:

@@ -75,8 +75,8 @@ class ConvertConfig(WritingConfig):
     is lifted in between, in which the times do not increase, or with fewer than 3 samples.
 
     Trajectories of a maze end where timeouts or terminals of D4RL say so, and where the goal changes. Those that end more
-    than 0.5 m from their goal, cut off, are left out. A recording in another maze is refused; a maze that no task has is taken
-    from a Minari dataset that names it.
+    than 0.5 m from their goal, cut off, are left out. A recording in another maze is refused; a maze that no task has is
+    taken from a Minari dataset that names it.
     """
 
     # The recording.
