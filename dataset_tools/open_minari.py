@@ -41,9 +41,7 @@ def open_minari(path: Path) -> MinariDataset:
             f"source.path must be the folder of a Minari dataset, got {path}, which does not exist"
         )
     try:
-        missing = [name for name in _SPACES if name not in _metadata(data)]
-        if missing:  # Minari would make the environment, that is, run what the file names
-            raise ValueError(f"its metadata.json holds no {missing[0]}")
+        _check_complete(data)
         dataset = minari.MinariDataset(data)
     except Exception as error:  # the storage formats raise a dozen types
         raise ValueError(
@@ -52,7 +50,7 @@ def open_minari(path: Path) -> MinariDataset:
     if (data / _HDF5).is_file():
         with opened_hdf5(data / _HDF5) as file:
             for number in dataset.episode_indices:
-                _check_episode(file, f"episode_{number}", dataset, path)
+                _check_episode(file[f"episode_{number}"], dataset, path)
     return dataset
 
 
@@ -73,7 +71,7 @@ def env_spec_of(path: Path) -> dict[str, Any]:
     """The specification of the environment in which a Minari dataset was recorded; empty if it holds none."""
     try:
         spec = json.loads(_metadata(_data_folder(path))["env_spec"])
-    except (OSError, KeyError, ValueError, TypeError):  # `open_minari` tells what is wrong
+    except (OSError, KeyError, ValueError, TypeError, RecursionError):  # `open_minari` tells what is wrong
         return {}
     return spec if isinstance(spec, dict) else {}
 
@@ -92,14 +90,31 @@ def _metadata(data: Path) -> dict[str, Any]:
     return content
 
 
-def _check_episode(file: h5py.File, name: str, dataset: MinariDataset, path: Path) -> None:
-    if not isinstance(file.get(name), h5py.Group):
-        n_found = sum(each.startswith("episode_") for each in file)
-        raise ValueError(
-            f"{path} must hold the {dataset.total_episodes} episodes that its metadata.json promises, got {n_found}, "
-            f"without {name}: its copy is incomplete"
-        )
-    episode = file[name]
+def _check_complete(data: Path) -> None:
+    """Checks that the files hold what the metadata promise, before anything is made of the promises."""
+    metadata = _metadata(data)
+    missing = [name for name in _SPACES if name not in metadata]
+    if missing:  # Minari would make the environment, that is, run what the file names
+        raise ValueError(f"its metadata.json holds no {missing[0]}")
+    n_promised, found = int(metadata["total_episodes"]), _episode_names(data)
+    for number in range(n_promised):  # ends at the first that is missing
+        if number not in found:
+            raise ValueError(
+                f"its metadata.json promises {n_promised} episodes, got {len(found)}, without episode_{number}: its copy is "
+                "incomplete"
+            )
+
+
+def _episode_names(data: Path) -> set[int]:
+    """The numbers of the episodes that are there."""
+    if not (data / _HDF5).is_file():  # as Arrow files, in a folder for each
+        return {int(folder.name) for folder in data.iterdir() if folder.name.isdecimal()}
+    with opened_hdf5(data / _HDF5) as file:
+        names = [name.removeprefix("episode_") for name in file if isinstance(file.get(name), h5py.Group)]
+    return {int(name) for name in names if name.isdecimal()}
+
+
+def _check_episode(episode: h5py.Group, dataset: MinariDataset, path: Path) -> None:
     _check_space(episode, "observations", dataset.observation_space, path)
     _check_space(episode, "actions", dataset.action_space, path)
     for column in ("rewards", "terminations", "truncations"):

@@ -473,6 +473,10 @@ def test_the_maze_of_a_minari_dataset_is_the_one_it_names(
     rows = [[int(cell) for cell in row] for row in OPEN.split("/")]
     rows[1][1], rows[3][5] = "r", "g"
     assert recorded_maze(with_env_spec(folder, {"kwargs": {"maze_map": rows}})) == OPEN
+    with pytest.raises(
+        ValueError, match=f"{folder} names a maze that cannot be used: maze_map must be closed"
+    ):
+        recorded_maze(with_env_spec(folder, {"kwargs": {"maze_map": [[0, 0], [0, 0]]}}))
     for spec in ({}, {"kwargs": {}}, {"kwargs": {"maze_map": 3}}, {"kwargs": []}):
         assert recorded_maze(with_env_spec(folder, spec)) is None
 
@@ -501,8 +505,18 @@ def test_minari_datasets_of_another_maze_are_refused_naming_it(
 def test_minari_datasets_of_an_ant_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = write_pointmaze(tmp_path, monkeypatch, demonstrations("umaze", 2))
     ant = {"id": "AntMaze_UMaze-v4", "entry_point": "gymnasium_robotics.envs.maze.ant_maze_v4:AntMazeEnv"}
-    with pytest.raises(ValueError, match=r"must hold PointMaze episodes, got AntMaze \(AntMaze_UMaze-v4\)"):
-        read_minari(with_env_spec(folder, ant))
+    for read in (read_minari, recorded_maze):
+        with pytest.raises(
+            ValueError, match=r"must hold PointMaze episodes, got AntMaze \(AntMaze_UMaze-v4\)"
+        ):
+            read(with_env_spec(folder, ant))
+
+
+def test_d4rl_files_of_an_ant_are_named(tmp_path: Path) -> None:
+    ant = {"observations": np.zeros((10, 29))}
+    path = write_d4rl(tmp_path / "a.hdf5", [line((-1, 1), (1, 1), 9)], LOPSIDED, with_timeouts=True, **ant)
+    with pytest.raises(ValueError, match=r"got \(10, 29\) and \(10, 2\) in .*, which is of AntMaze"):
+        read_d4rl(path, LOPSIDED)
 
 
 def test_incomplete_and_old_minari_datasets_are_named(
@@ -516,12 +530,13 @@ def test_incomplete_and_old_minari_datasets_are_named(
         read_minari(folder)
     with h5py.File(path, "a") as file:
         del file["episode_1"]
-    with pytest.raises(
-        ValueError, match="the 3 episodes that its metadata.json promises, got 2, without episode_1"
-    ):
+    with pytest.raises(ValueError, match="its metadata.json promises 3 episodes, got 2, without episode_1"):
         read_minari(folder)
     metadata = folder / "data" / "metadata.json"
     content = json.loads(metadata.read_text())
+    metadata.write_text(json.dumps({**content, "total_episodes": 10**12}))
+    with pytest.raises(ValueError, match="promises 1000000000000 episodes, got 2, without episode_1"):
+        read_minari(folder)
     metadata.write_text(json.dumps({**content, "observation_space": None} | {"env_spec": "{}"}))
     with pytest.raises(ValueError, match="must hold a Minari dataset, got one that cannot be read"):
         read_minari(folder)

@@ -126,6 +126,7 @@ def test_empty_rows_between_samples_are_skipped(tmp_path: Path) -> None:
             "time,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n",
             r"got \[.*\]: poses of an end effector \(time, x, y, z, qx",
         ),
+        ("time,pos_x,pos_y,pos_z,quat_x,quat_y\n0,0,0,0,0,0\n", "poses of an end effector"),
         ("time,x,y,z,roll,pitch,yaw\n0,0,0,0,0,0,0\n", "poses of an end effector"),
         ("time,delta_x,delta_y\n0,0,0\n", r"displacements or rates \(delta_x, delta_y\)"),
         (

@@ -118,7 +118,9 @@ def read_handwriting(
         raise FileNotFoundError(f"source.path must be a file or folder, got {path}, which does not exist")
     frame = RecordingFrame(joint_offsets, scale, place)
     if not path.is_dir() and path.suffix.lower() not in _READERS:
-        raise ValueError(f"a recording must be a .csv or .json file or a LeRobotDataset's folder, got {path}")
+        raise ValueError(
+            f"a recording must be a .csv or .json file or a LeRobotDataset's folder, or a .tsv or .jsonl file, got {path}"
+        )
     episodes = read_dataset(path) if path.is_dir() else _READERS[path.suffix.lower()](path)
     are_joints = [each.values.shape[1] >= N_ARM_JOINTS for each in episodes]
     if episodes:

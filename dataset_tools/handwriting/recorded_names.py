@@ -46,7 +46,9 @@ _UNIT = re.compile(r"\s*[\[(](?:s|m|rad)[\])]$")
 _DISPLACEMENT = re.compile(
     r"d[xyz]|delta|rel|relative|diff|displacement|vel|velocity|speed|acc|torque|effort"
 )
-_ROTATION = re.compile(r"q[wxyz]|r[xyz]|roll|pitch|yaw")
+_ROTATION = re.compile(
+    r"q[wxyz]|r[xyz]|roll|pitch|yaw|quat(?:ernion)?|rot(?:ation)?|orientation|euler|rpy|ori"
+)
 
 
 def meanings(names: Sequence[str]) -> list[str | None]:
@@ -76,8 +78,10 @@ def other_data(names: Sequence[str]) -> str | None:
 
 def are_poses(names: Sequence[str]) -> bool:
     """Whether names are those of positions together with orientations, as of an end effector."""
-    words = [re.split(r"[_./ ]", name.strip().lower())[-1] for name in names]
-    return {"x", "y"} <= set(words) and any(_ROTATION.fullmatch(word) for word in words)
+    words = [_words(name.strip().lower()) for name in names]
+    turns = [any(_ROTATION.fullmatch(word) for word in each) for each in words]
+    places = {each[-1] for each, turn in zip(words, turns, strict=True) if not turn}
+    return any(turns) and {"x", "y"} <= places
 
 
 def _meaning(plain: str) -> str | None:
@@ -90,4 +94,8 @@ def _meaning(plain: str) -> str | None:
 
 
 def _is_displacement(plain: str) -> bool:
-    return any(_DISPLACEMENT.fullmatch(word) for word in re.split(r"[_./ ]", plain))
+    return any(_DISPLACEMENT.fullmatch(word) for word in _words(plain))
+
+
+def _words(plain: str) -> list[str]:
+    return re.split(r"[_./ ]", plain)

@@ -21,6 +21,7 @@ _CELL_OFFSET = 1.2 - 1.0
 # Two recorded goals within this distance are the same goal: they differ only by rounding, as its noise is drawn once.
 _SAME_GOAL = 1e-5  # [m]
 _COLUMNS = ("observations", "infos/goal")
+_ANT_WIDTH = 29  # of the observations of D4RL's antmaze
 _ENDS = ("timeouts", "terminals")  # columns that are true in the last row of a trajectory
 _SLICE_ROWS = 2**16  # rows that are read at a time
 
@@ -136,8 +137,9 @@ def _columns(file: h5py.File, path: Path) -> dict[str, h5py.Dataset]:
     n_rows = len(columns["observations"])
     observations, goals = (columns[name].shape for name in _COLUMNS)
     if observations != (n_rows, 4) or goals != (n_rows, 2):
+        hint = ", which is of AntMaze" if observations[1:] == (_ANT_WIDTH,) else ""
         raise ValueError(
-            f"observations must have shape (N, 4) and infos/goal (N, 2), got {observations} and {goals} in {path}"
+            f"observations must have shape (N, 4) and infos/goal (N, 2), got {observations} and {goals} in {path}{hint}"
         )
     for name in _ENDS:
         if name in columns and columns[name].shape != (n_rows,):

@@ -13,19 +13,22 @@ import numpy as np
 from lerobot_pf2mp.dataset_tools.maze.maze_recognition import check_maze
 from lerobot_pf2mp.dataset_tools.open_minari import env_spec_of, episodes_in, open_minari
 from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory
+from lerobot_pf2mp.envs.maze.point_maze import parse_maze_map
+from lerobot_pf2mp.errors import explained
 
 if TYPE_CHECKING:
     from minari import MinariDataset
 
 _SAME_GOAL = 1e-5  # largest difference of coordinates between equal goals [m]
+_WIDTH = 4  # of an observation: position and velocity
 _N_COMPARED = 50  # episodes by which another maze is recognised
 
 
 def read_minari(path: Path, maze: str | None = None) -> tuple[int, Iterator[Trajectory]]:
     """Reads the trajectories of a Minari PointMaze dataset. Its coordinates are those of this package.
 
-    An episode in which the goal changes, as in continuing tasks, is one trajectory for each goal. The last of them may be cut
-    off, far from its goal.
+    An episode in which the goal changes, as in continuing tasks, is one trajectory for each goal. The last of them may be
+    cut off, far from its goal.
 
     Args:
         path: The dataset's folder, for example ``~/.minari/datasets/D4RL/pointmaze/large-v2``.
@@ -47,23 +50,28 @@ def read_minari(path: Path, maze: str | None = None) -> tuple[int, Iterator[Traj
 
 
 def recorded_maze(path: Path) -> str | None:
-    """The maze in which a Minari dataset says that it was recorded, as for `parse_maze_map`; None if it says nothing."""
+    """The maze in which a Minari dataset says that it was recorded, as for `parse_maze_map`; None if it says nothing.
+
+    Raises:
+        ValueError: If it is that of an ant, or no maze.
+    """
+    _check_no_ant(path)
     kwargs = env_spec_of(path).get("kwargs")
     rows = kwargs.get("maze_map") if isinstance(kwargs, dict) else None
     if not isinstance(rows, list) or not all(isinstance(row, list) for row in rows):
         return None
     # Free cells may hold letters, for the starts and the goals.
-    return "/".join("".join("1" if cell == 1 else "0" for cell in row) for row in rows)
+    maze = "/".join("".join("1" if cell == 1 else "0" for cell in row) for row in rows)
+    with explained(f"{path} names a maze that cannot be used"):
+        parse_maze_map(maze)
+    return maze
 
 
 def _check_no_ant(path: Path) -> None:
     spec = env_spec_of(path)
-    if "ant" in str(spec.get("id", "")).lower().split("maze")[0] or "ant_maze" in str(
-        spec.get("entry_point", "")
-    ):
-        raise ValueError(
-            f"{path} must hold PointMaze episodes, got AntMaze ({spec.get('id')}): an ant, with joints, is no ball"
-        )
+    name = str(spec.get("id"))
+    if name.lower().startswith("antmaze") or "ant_maze" in str(spec.get("entry_point")):
+        raise ValueError(f"{path} must hold PointMaze episodes, got AntMaze ({name}), whose ant is no ball")
 
 
 def _trajectories(dataset: MinariDataset, path: Path) -> Iterator[Trajectory]:
@@ -89,5 +97,10 @@ def _episodes(dataset: MinariDataset, path: Path) -> Iterator[tuple[np.ndarray, 
             raise ValueError(
                 f"{path} must hold PointMaze episodes, positions and goals in the plane, got {positions.shape} and "
                 f"{goals.shape}"
+            )
+        width = np.shape(observations.get("observation", np.empty((0, _WIDTH))))[-1]
+        if width != _WIDTH:
+            raise ValueError(
+                f"{path} must hold PointMaze episodes with {_WIDTH} numbers in observation, got {width}: those of AntMaze?"
             )
         yield positions, goals
