@@ -90,7 +90,7 @@ def test_of_several_times_the_first_kind_is_taken(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mark", ["", "\ufeff"])
-@pytest.mark.parametrize("first", ["", "sep=;\n", '"sep=;"\n', "\n\n"])
+@pytest.mark.parametrize("first", ["", "sep=;\n", "SEP=;\r\n", '"sep=;"\n', "\n\n"])
 @pytest.mark.parametrize("last", ["", "\n\n", ";;\n"])
 def test_spreadsheets_of_other_countries_are_read(tmp_path: Path, mark: str, first: str, last: str) -> None:
     content = text(["time", "x", "y"], [TIMES, *STRAIGHT.T], separator=";").replace(".", ",")
@@ -116,6 +116,10 @@ def test_empty_rows_between_samples_are_skipped(tmp_path: Path) -> None:
         (
             "time,x,y\n0,0,5,0,1\n",
             r"as columns, 3, got 5 in row 0 \(line 2\); decimal commas need another sep",
+        ),
+        (
+            "time,x,y,episode\n0,0.5,0,a\n0,0.5,0\n",
+            r"name the episode of each row, got none in row 1 \(line 3\)",
         ),
         ("time,x,y,pen\n0,0.5,0,lifted\n", r"got 'lifted' as pen in row 0 \(line 2\)"),
         (

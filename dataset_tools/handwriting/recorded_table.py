@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from lerobot_pf2mp.dataset_tools.handwriting.recorded_names import (
 )
 
 _SEPARATORS = ",;\t"
+_SEP = re.compile(r'"?sep=([,;\t|])"?', re.IGNORECASE)  # a first line of Excel's
 _TRUE, _FALSE = ("true", "yes", "down"), ("false", "no", "up")
 
 _Row = tuple[int, Sequence[str]]  # the number of its line in the file, and its cells
@@ -83,9 +85,13 @@ def episodes_of(header: Sequence[str], rows: Sequence[_Row], path: Path) -> list
     times, values = column("time"), np.stack([column(name) for name in names], axis=1)
     heights = column("z") if names == PEN and "z" in found else None
     is_down = _is_down(found, column)
-    labels = [cells[found.index("episode")] for _, cells in rows] if "episode" in found else ["0"] * len(rows)
     of_label: dict[str, list[int]] = {}
-    for number, label in enumerate(labels):
+    for number, (line, cells) in enumerate(rows):
+        label = _cell(cells, found.index("episode")) if "episode" in found else "0"
+        if not label:
+            raise ValueError(
+                f"{path} must name the episode of each row, got none in row {number} (line {line})"
+            )
         of_label.setdefault(label, []).append(number)
     return [
         RecordedEpisode(
@@ -102,10 +108,9 @@ def episodes_of(header: Sequence[str], rows: Sequence[_Row], path: Path) -> list
 def _rows(text: str) -> Iterator[_Row]:
     """The rows of a table that are not empty, the header first."""
     first, _, rest = text.partition("\n")
-    told = first.strip().strip('"')
-    n_skipped = 0
-    if told.lower().startswith("sep=") and len(told) == len("sep=") + 1:
-        separator, text, n_skipped = told[-1], rest, 1
+    told = _SEP.fullmatch(first)
+    if told:
+        text, separator = rest, told[1]
     else:
         header = next((line for line in text.splitlines() if line.strip(_SEPARATORS + " ")), "")
         separator = max(_SEPARATORS, key=header.count)
@@ -113,7 +118,7 @@ def _rows(text: str) -> Iterator[_Row]:
     for row in reader:
         cells = [cell.strip() for cell in row]
         if any(cells):
-            yield reader.line_num + n_skipped, cells
+            yield reader.line_num + bool(told), cells
 
 
 def _value_columns(header: Sequence[str], found: Sequence[str | None], path: Path) -> tuple[str, ...]:
@@ -136,7 +141,7 @@ def _column(
 ) -> np.ndarray:
     numbers = np.empty(len(rows))
     for number, (line, cells) in enumerate(rows):
-        cell = cells[index] if index < len(cells) else ""
+        cell = _cell(cells, index)
         try:
             numbers[number] = number_of(cell)
         except ValueError as error:
@@ -145,6 +150,10 @@ def _column(
                 f"(line {line})"
             ) from error
     return numbers
+
+
+def _cell(cells: Sequence[str], index: int) -> str:
+    return cells[index] if index < len(cells) else ""
 
 
 def _is_down(found: Sequence[str | None], column: Callable[..., np.ndarray]) -> np.ndarray | None:

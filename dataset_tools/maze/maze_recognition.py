@@ -13,12 +13,10 @@ from lerobot_pf2mp.envs.tasks import MAZE_OF_TASK
 
 _OPEN = "1111111/1000001/1000001/1000001/1111111"  # D4RL's maze2d-open
 _KNOWN = {**{f"--task={task}": maze for task, maze in MAZE_OF_TASK.items()}, f"--maze_map={_OPEN}": _OPEN}
-# No ball gets into a wall, but a few positions may come from elsewhere.
-_FITS, _MAY_FIT = (
-    0.001,
-    0.01,
-)  # largest shares of the positions inside walls, for a maze that fits and for the chosen one
-_FITS_IN_PARTS = 0.3  # the same for the chosen maze, if no other fits
+# Largest shares of the positions that may lie inside walls. A ball never does, but a few positions may come from elsewhere.
+_FITS = 0.001  # of a maze that fits
+_MAY_FIT = 0.01  # of the chosen maze
+_FITS_IN_PARTS = 0.3  # of the chosen maze, if no other fits
 
 _Rows = list[list[int]]
 
