@@ -45,20 +45,27 @@ def array_in(group: h5py.Group, name: str, path: Path) -> h5py.Dataset:
     Raises:
         ValueError: If there is something else under this name, or much less is stored than the array's shape says.
     """
-    entry, full_name = _entry(group, name), f"{group.name}/{name}".strip("/")
+    entry = _entry(group, name)
     if isinstance(entry, str):
         raise ValueError(
-            f"{full_name} must be an array of real numbers that the file itself holds, got {entry} in {path}"
+            f"{_full_name(group, name)} must be an array of real numbers that the file itself holds, got {entry} in {path}"
         )
-    check_size(full_name, entry.shape, entry.nbytes, entry.id.get_storage_size(), path)
+    n_stored = entry.id.get_storage_size()
+    if not n_stored or entry.nbytes > n_stored:  # asking for the name takes time
+        check_size(_full_name(group, name), entry.shape, entry.nbytes, n_stored, path)
     return entry
+
+
+def _full_name(group: h5py.Group, name: str) -> str:
+    return f"{group.name}/{name}".strip("/")
 
 
 def _entry(group: h5py.Group, name: str) -> h5py.Dataset | str:
     """What is under a name: an array of numbers, or the words for anything else."""
-    if not holds(group, name):
+    link = group.get(name, getlink=True)
+    if link is None:
         return "nothing"
-    if isinstance(group.get(name, getlink=True), h5py.ExternalLink):
+    if isinstance(link, h5py.ExternalLink):
         return "a link to another file"
     try:
         entry = group[name]

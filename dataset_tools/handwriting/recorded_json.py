@@ -70,7 +70,7 @@ def _episode(content: Any, number: int, path: Path) -> RecordedEpisode:
     columns = {key if key in _WIDTHS else meaning: _array(content[key]) for key, meaning in found}
     kinds = [kind for kind in _WIDTHS if kind in columns]
     if len(kinds) != 1 or not {"time"} <= set(columns) <= {"time", *kinds, *PEN_STATES}:
-        raise ValueError(f"{_LAYOUT} {name} of {path}")
+        raise ValueError(f"{_LAYOUT} {name} of {path}: {', '.join(content) or 'nothing'}")
     times, values = columns["time"], columns[kinds[0]]
     if times.ndim != 1 or values.ndim != 2 or values.shape[1] not in _WIDTHS[kinds[0]]:
         raise ValueError(f"{_LAYOUT} {name} of {path}{_width_of(values)}")
