@@ -385,6 +385,24 @@ def test_datasets_are_read_without_their_videos_and_never_looked_for_on_the_hub(
     np.testing.assert_allclose(read_handwriting(path)[0].values[:, :7], JOINTS, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"total_frames": 13}, "must hold the 13 frames of its meta/info.json, and one at least, got 12"),
+        ({"total_frames": None}, "cannot be read as a LeRobotDataset"),
+        ({"features": {"action": {"shape": [9]}}}, "its actions must be 9 numbers, got 7"),
+    ],
+)
+def test_datasets_whose_metadata_promise_something_else_are_refused(
+    tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
+    path = actions_of(tmp_path / "d", JOINTS, ARM)
+    info = json.loads((path / "meta" / "info.json").read_text())
+    (path / "meta" / "info.json").write_text(json.dumps({**info, **changes}))
+    with pytest.raises(ValueError, match=message):
+        read_handwriting(path)
+
+
 def test_datasets_that_have_lost_a_file_are_refused(tmp_path: Path) -> None:
     path = actions_of(tmp_path / "d", JOINTS, ARM)
     (file,) = (path / "data").rglob("*.parquet")

@@ -38,10 +38,10 @@ def read_dataset(path: Path) -> list[RecordedEpisode]:
         info = json.loads((path / "meta" / "info.json").read_text(encoding="utf-8"))
         feature, n_frames = info["features"].get("action"), int(info["total_frames"])
         shape = tuple(feature["shape"]) if feature else ()
-        names = _names(feature["names"], len(shape) and shape[0]) if feature else []
+        names = _names(feature.get("names"), len(shape) and shape[0]) if feature else []
     order = _order(names, shape, path)
     with explained(f"{path} cannot be read as a LeRobotDataset"):
-        columns = _read_columns(path, n_frames)
+        columns = _read_columns(path, n_frames, width=shape[0])
     actions = columns["action"][:, order]
     if not names:
         _check_elbow(actions[:, _ELBOW], path)
@@ -85,15 +85,19 @@ def _order(names: list[str], shape: tuple[int, ...], path: Path) -> list[int]:
     )
 
 
-def _read_columns(path: Path, n_frames: int) -> dict[str, np.ndarray]:
+def _read_columns(path: Path, n_frames: int, width: int) -> dict[str, np.ndarray]:
     """Actions ``(N, A)``, times ``(N,)`` [s] and numbers of episodes ``(N,)``, in order."""
     files = sorted((path / "data").rglob("*.parquet"), key=_numbers_in)
     if not files:
         raise ValueError("it holds no data/*.parquet")
-    table = pa.concat_tables([pq.read_table(file, columns=list(_COLUMNS)) for file in files])
-    if len(table) != n_frames:
-        raise ValueError(f"it must hold {n_frames} frames, got {len(table)} in data")
+    table = pa.concat_tables([pq.ParquetFile(file).read(columns=list(_COLUMNS)) for file in files])
+    if not len(table) == n_frames > 0:
+        raise ValueError(
+            f"it must hold the {n_frames} frames of its meta/info.json, and one at least, got {len(table)}"
+        )
     columns = {name: _matrix(table[name]) for name in _COLUMNS}
+    if columns["action"].shape[1] != width:
+        raise ValueError(f"its actions must be {width} numbers, got {columns['action'].shape[1]}")
     return {**columns, **{name: columns[name][:, 0] for name in _COLUMNS[1:]}}
 
 

@@ -57,15 +57,26 @@ def aggregate_episodes(stats: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     def weighted_mean(values: np.ndarray) -> np.ndarray:
         return (values * count).sum(axis=0) / count.sum()
 
-    low, high, mean = stats["min"].min(axis=0), stats["max"].max(axis=0), weighted_mean(stats["mean"])
-    std = np.sqrt(weighted_mean(stats["std"] ** 2 + (stats["mean"] - mean) ** 2))
+    mean = weighted_mean(stats["mean"])
+    return with_exact_constants(
+        {
+            **{name: weighted_mean(values) for name, values in stats.items() if name.startswith("q")},
+            "min": stats["min"].min(axis=0),
+            "max": stats["max"].max(axis=0),
+            "mean": mean,
+            "std": np.sqrt(weighted_mean(stats["std"] ** 2 + (stats["mean"] - mean) ** 2)),
+            "count": count.sum(axis=0),
+        }
+    )
+
+
+def with_exact_constants(stats: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """LeRobot's statistics ``(D,)`` of one feature, with the mean and the standard deviation that a constant has."""
+    is_constant = stats["min"] == stats["max"]
     return {
-        **{name: weighted_mean(values) for name, values in stats.items() if name.startswith("q")},
-        "min": low,
-        "max": high,
-        "mean": np.where(low == high, low, mean),
-        "std": np.where(low == high, 0.0, std),
-        "count": count.sum(axis=0),
+        **stats,
+        "mean": np.where(is_constant, stats["min"], stats["mean"]),
+        "std": np.where(is_constant, 0.0, stats["std"]),
     }
 
 

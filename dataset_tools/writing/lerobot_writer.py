@@ -63,8 +63,7 @@ def write_dataset(
 
     It differs from LeRobot's recorder in three respects:
 
-    - Statistics of a dimension that is constant, in an episode or in all, are exact, see `compute_stats`. Those of
-      `write_video_dataset` are LeRobot's.
+    - Statistics of a dimension that is constant, in an episode or in all, are exact, see `compute_stats`.
     - Statistics of all episodes are computed at the end of each batch, not one episode after the other, which rounds in
       another order; columns of the episodes' metadata are in another order, which no reader depends on.
     - The card is that of the specification, because LeRobot's says nothing about the data. Its first lines tell `datasets`

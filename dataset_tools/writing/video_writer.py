@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 from lerobot.datasets import LeRobotDataset
+from lerobot.datasets.io_utils import write_stats
 
+from lerobot_pf2mp.dataset_tools.writing.episode_stats import with_exact_constants
 from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec
 from lerobot_pf2mp.process.atomic_files import written_beside
 
@@ -23,6 +25,7 @@ def write_video_dataset(
 ) -> int:
     """Writes episodes with images; the arguments, the result and the errors are those of `write_dataset`.
 
+    Statistics are those of LeRobot, except for what is constant in all episodes, which is exact as in `write_dataset`.
     Features of dtype ``video`` take ``(T, H, W, 3)`` uint8 images.
     """
     with written_beside(root, overwrite, kind="dataset", mark="meta/info.json", option="--root") as partial:
@@ -49,5 +52,6 @@ def write_video_dataset(
             if dataset.has_pending_frames():
                 dataset.clear_episode_buffer()
             dataset.finalize()
+        write_stats({key: with_exact_constants(stats) for key, stats in dataset.meta.stats.items()}, partial)
         (partial / "README.md").write_text(spec.card, encoding="utf-8")
     return n_written
