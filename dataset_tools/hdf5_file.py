@@ -30,7 +30,7 @@ def holds(group: h5py.Group, name: str) -> bool:
     """Whether there is anything under a name, be it a link that leads nowhere."""
     try:
         return group.get(name, getlink=True) is not None
-    except KeyError:  # something on the way to it is no group
+    except (KeyError, RuntimeError):  # something on the way to it is no group, or a link to itself
         return False
 
 
@@ -69,7 +69,7 @@ def _entry(group: h5py.Group, name: str) -> h5py.Dataset | str:
         return "a link to another file"
     try:
         entry = group[name]
-    except KeyError:
+    except (KeyError, RuntimeError):  # the latter if it leads to itself
         return "a link that leads nowhere"
     if not isinstance(entry, h5py.Dataset):
         return f"a {type(entry).__name__.lower()}"

@@ -45,7 +45,7 @@ def open_minari(path: Path) -> MinariDataset:
         dataset = minari.MinariDataset(data)
     except Exception as error:  # the storage formats raise a dozen types
         raise ValueError(
-            f"{path} must hold a Minari dataset, got one that cannot be read: {error}"
+            f"{path} must hold a Minari dataset, got one that cannot be read: {str(error) or type(error).__name__}"
         ) from error
     if (data / _HDF5).is_file():
         with opened_hdf5(data / _HDF5) as file:
@@ -96,7 +96,9 @@ def _check_complete(data: Path) -> None:
     missing = [name for name in _SPACES if name not in metadata]
     if missing:  # Minari would make the environment, that is, run what the file names
         raise ValueError(f"its metadata.json holds no {missing[0]}")
-    n_promised, found = int(metadata["total_episodes"]), _episode_names(data)
+    n_promised, found = metadata.get("total_episodes"), _episode_names(data)
+    if not isinstance(n_promised, int) or n_promised < 1:
+        raise ValueError(f"its metadata.json must promise at least one episode, got {n_promised}")
     for number in range(n_promised):  # ends at the first that is missing
         if number not in found:
             raise ValueError(

@@ -322,6 +322,10 @@ def a_link_that_leads_nowhere(file: h5py.File, name: str) -> None:
     file[name] = h5py.SoftLink("/nowhere")
 
 
+def a_link_to_itself(file: h5py.File, name: str) -> None:
+    file[name] = h5py.SoftLink(f"/{name}")
+
+
 def a_link_to_another_file(file: h5py.File, name: str) -> None:
     file[name] = h5py.ExternalLink("other.hdf5", "/observations")
 
@@ -364,6 +368,7 @@ def virtual(file: h5py.File, name: str) -> None:
     ("put", "found"),
     [
         (a_link_that_leads_nowhere, "a link that leads nowhere"),
+        (a_link_to_itself, "a link that leads nowhere"),
         (a_link_to_another_file, "a link to another file"),
         (a_group, "a group"),
         (references, "elements of type reference"),
@@ -534,6 +539,10 @@ def test_incomplete_and_old_minari_datasets_are_named(
         read_minari(folder)
     metadata = folder / "data" / "metadata.json"
     content = json.loads(metadata.read_text())
+    for total in (0, 2.5, None, "3"):
+        metadata.write_text(json.dumps({**content, "total_episodes": total}))
+        with pytest.raises(ValueError, match=f"must promise at least one episode, got {total}"):
+            read_minari(folder)
     metadata.write_text(json.dumps({**content, "total_episodes": 10**12}))
     with pytest.raises(ValueError, match="promises 1000000000000 episodes, got 2, without episode_1"):
         read_minari(folder)
