@@ -14,6 +14,7 @@ from lerobot_pf2mp.dataset_tools.maze.maze_expert import MazeExpert
 from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory
 from lerobot_pf2mp.envs.maze.point_maze import parse_maze_map
 
+OPEN = "1111111/1000001/1000001/1000001/1111111"  # D4RL's maze2d-open
 FOREIGN_LAYOUT = "observations and infos/goal"
 
 
@@ -104,11 +105,12 @@ def write_pointmaze(
         }
     )
     observations = []
-    stale = trajectories[0].goal
+    stale = np.atleast_2d(trajectories[0].goal)[0]
     for trajectory in trajectories:
-        goals = np.tile(trajectory.goal, (len(trajectory.positions), 1))
+        # One goal, or one for each position.
+        goals = np.array(np.broadcast_to(trajectory.goal, (len(trajectory.positions), n_dims)))
         goals[0] = stale
-        stale = trajectory.goal
+        stale = goals[-1]
         observations.append(
             {
                 "observation": np.zeros((len(goals), 4)),

@@ -13,6 +13,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 import torch
+from datasets import load_dataset
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
@@ -272,6 +273,17 @@ def test_the_statistics_equal_those_of_a_dataset_written_by_lerobot(pair) -> Non
             np.testing.assert_allclose(
                 ours[feature][name], values, rtol=1e-12, atol=1e-15, err_msg=f"{feature} {name}"
             )
+
+
+def test_a_dataset_opens_with_datasets_and_names_its_robot(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = {"root": tmp_path / "d", "repo_id": "a/b", "maze": CORRIDOR, "origin": "", "n_steps": 10}
+    write_maze_dataset(straight_lines(20, 30), **options)
+    frames = load_dataset(str(tmp_path / "d"), cache_dir=str(tmp_path / "cache"))["train"]
+    assert len(frames) == 20
+    assert set(frames.column_names) >= {"observation.state", "action", "episode_index"}
+    assert LeRobotDatasetMetadata("a/b", root=tmp_path / "d").robot_type == "point_maze"
 
 
 def test_the_statistics_are_those_of_all_frames(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ LENGTHS = np.array([80, 1, 2, 80, 3, 1, 300, 5, 64, 100, 129, 2])
 KINDS = {
     "noise": lambda rng, shape: rng.normal(size=shape),
     "a way far from the origin": lambda rng, shape: rng.normal(size=shape).cumsum(axis=0) + 1e4,
-    "a constant": lambda rng, shape: np.full(shape, rng.normal()),
     "a few values a rounding error apart": lambda rng, shape: 1 + 1e-7 * rng.integers(0, 3, size=shape),
     "values closer than the histogram's padding": lambda rng, shape: 1e-11 * rng.normal(size=shape),
     "whole numbers": lambda rng, shape: rng.integers(-3, 4, size=shape),
@@ -40,6 +39,24 @@ def test_the_statistics_of_each_episode_are_those_of_lerobot_to_the_last_bit(
         assert stats.keys() == expected.keys()
         for name, value in expected.items():
             np.testing.assert_array_equal(stats[name][number], value, err_msg=f"{name} of {number}")
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("value", [0.007, -2.3932, 4.1, 1e4])
+def test_a_constant_has_its_value_as_mean_and_no_standard_deviation(value: float, dtype: type) -> None:
+    # LeRobot's own standard deviation is a rounding error there.
+    rng = np.random.default_rng(0)
+    frames = np.column_stack([np.full(LENGTHS.sum(), value), rng.normal(size=LENGTHS.sum())]).astype(dtype)
+    stats = compute_stats(frames, LENGTHS)
+    for each in (stats, aggregate_episodes(stats)):
+        assert (each["std"][..., 0] == 0).all()
+        for name in ("mean", "min", "max"):
+            assert (each[name][..., 0] == dtype(value)).all()
+        np.testing.assert_allclose(each["q50"][..., 0], dtype(value), rtol=1e-6)
+    for number, part in enumerate(np.split(frames, np.cumsum(LENGTHS)[:-1])):
+        expected = of_lerobot(part)
+        for name in expected:
+            np.testing.assert_array_equal(stats[name][number][-1], expected[name][-1], err_msg=name)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import gc
+import io
 import itertools
 import json
 import math
@@ -8,6 +9,7 @@ import re
 import signal
 import sys
 import time
+import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
@@ -1092,6 +1094,23 @@ def test_npz_files_that_are_garbled_in_the_middle_are_refused(tmp_path: Path) ->
     ):
         convert(path, "reach", tmp_path / "d")
     assert everything_in(tmp_path) == ["others.npz"]
+
+
+def test_npz_files_that_unpack_to_much_more_than_is_stored_are_refused_before_they_are_read(
+    tmp_path: Path,
+) -> None:
+    def header(shape: tuple[int, ...]) -> bytes:
+        stream = io.BytesIO()
+        np.lib.format.write_array_header_1_0(stream, {"shape": shape, "fortran_order": False, "descr": "<f8"})
+        return stream.getvalue()
+
+    path = write_npz(tmp_path / "others.npz", changed(REACH, observation=None))
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("observation.npy", header((10**9, 11, 10)) + bytes(10**6))
+    with pytest.raises(
+        ValueError, match=r"observation must be stored .* shape \(1000000000, 11, 10\) and 8.8e\+"
+    ):
+        read_fetch(path, "reach")
 
 
 def test_a_missing_recording_is_named(tmp_path: Path) -> None:

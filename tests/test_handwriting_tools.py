@@ -787,8 +787,8 @@ def without(columns: dict, *names: str) -> dict:
             "times must increase, got 0.2 s after 0.2 s in row 3 of episode 0 of .*others.csv",
         ),
         (
-            stacked(columns_of(PLACES), columns_of(PLACES, times=np.array([0.0, 0.3, 0.1, 0.4, 0.5, 0.6]))),
-            "times must increase, got 0.1 s after 0.3 s in row 2 of episode 1",
+            stacked(*[columns_of(PLACES, times=np.array([0.0, 0.3, 0.1, 0.4, 0.5, 0.6]))] * 2),
+            "none that is usable: times must increase, got 0.1 s after 0.3 s in row 2 of episode 0",
         ),
         (columns_of(PLACES[:2]), "episode 0 of .* at least 3 samples, .* got 2 times and 2 samples"),
         (columns_of(PLACES[:0]), "others.csv must hold at least one episode, got none"),

@@ -22,6 +22,7 @@ def episode(grey: int) -> dict[str, np.ndarray]:
         -1, 1, 1, 1
     )
     positions = np.random.default_rng(grey).random((6, 3), dtype=np.float32)
+    positions[:, 2] = 4.1
     return {
         "observation.state": positions,
         "action": positions,
@@ -44,6 +45,11 @@ def test_images_and_numbers_read_back(tmp_path: Path) -> None:
             assert item[IMAGE_KEY].shape == (3, 48, 64)
             assert 255 * float(item[IMAGE_KEY].mean()) == pytest.approx(grey + 10 * frame, abs=4)
     assert (root / "README.md").read_text() == SPEC.card
+    assert dataset.meta.robot_type == "fetch"
+    for key in ("action", "observation.state"):
+        assert dataset.meta.stats[key]["std"][2] == 0
+        assert dataset.meta.stats[key]["mean"][2] == np.float32(4.1)
+        assert (dataset.meta.stats[key]["std"][:2] > 0.1).all()
 
 
 def test_a_dataset_without_episodes_or_with_an_error_on_the_way_leaves_nothing(tmp_path: Path) -> None:

@@ -32,7 +32,8 @@ from typing import Any
 import numpy as np
 
 from lerobot_pf2mp.dataset_tools.fetch.fetch_dataset import fetch_spec
-from lerobot_pf2mp.dataset_tools.open_minari import open_minari
+from lerobot_pf2mp.dataset_tools.npz_file import read_npz
+from lerobot_pf2mp.dataset_tools.open_minari import episodes_in, open_minari
 from lerobot_pf2mp.dataset_tools.writing.episodes import MIN_STEPS, Trajectory, resample
 from lerobot_pf2mp.dataset_tools.writing.write_trajectories import write_trajectories
 from lerobot_pf2mp.envs.box import Box
@@ -182,16 +183,7 @@ def _load(path: Path) -> dict[str, np.ndarray]:
         )
     if not zipfile.is_zipfile(path):
         raise ValueError(f"{path} must be a whole npz file or the folder of a Minari dataset, got neither")
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            found = list(file.files)
-            arrays = {
-                name: np.asarray(file[name]) for name in (*_COLUMNS, "episode_ends", *_FLAGS) if name in found
-            }
-    except Exception as error:  # the readers of zip and npy raise a dozen types
-        raise ValueError(
-            f"{path} must be a whole npz file without pickles, got one that cannot be read: {error}"
-        ) from error
+    found, arrays = read_npz(path, (*_COLUMNS, "episode_ends", *_FLAGS))
     missing = [name for name in _COLUMNS[:2] if name not in arrays]
     if missing:
         raise ValueError(
@@ -237,7 +229,7 @@ def _read_minari(path: Path) -> tuple[int, Iterator[dict[str, np.ndarray]]]:
 
 
 def _observations(dataset: Any, path: Path) -> Iterator[dict[str, np.ndarray]]:
-    for episode in dataset.iterate_episodes():
+    for episode in episodes_in(dataset, path):
         observations = episode.observations
         if not isinstance(observations, dict) or not set(_COLUMNS) <= set(observations):
             raise ValueError(

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 from typing import Any
 
+from lerobot_pf2mp.dataset_tools.writing.card import card_header
 from lerobot_pf2mp.dataset_tools.writing.episodes import IMAGE_KEY
 from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, image_feature
 
+ROBOT = "fetch"
 FPS = 25
 TASK_DESCRIPTIONS = {
     "reach": "Move the gripper to the red goal without touching the wall.",
@@ -18,12 +20,7 @@ _XYZ = ["x", "y", "z"]
 _OBJECTS = {"reach": ["goal"], "push": ["block", "goal"]}
 
 _CARD = """\
----
-license: apache-2.0
-task_categories: [robotics]
-tags: [LeRobot, pf2mp, fetch]
----
-# {title}
+{header}# {title}
 
 {description} A Fetch robot in MuJoCo, and none of its demonstrations touches the wall. {origin}
 
@@ -56,13 +53,19 @@ def fetch_spec(
     description = TASK_DESCRIPTIONS[task]
     objects = " and ".join(_OBJECTS[task])
     card = _CARD.format(
-        title=repo_id, description=description, origin=origin, n_steps=n_steps, fps=FPS, objects=objects
+        header=card_header("fetch"),
+        title=repo_id,
+        description=description,
+        origin=origin,
+        n_steps=n_steps,
+        fps=FPS,
+        objects=objects,
     )
     features = _features_of(task)
     if image_size is not None:
         del features["observation.environment_state"]
         features[IMAGE_KEY] = image_feature(image_size)
-    return DatasetSpec(repo_id, FPS, features, description, card)
+    return DatasetSpec(repo_id, FPS, features, description, card, ROBOT)
 
 
 def _features_of(task: str) -> dict[str, dict[str, Any]]:

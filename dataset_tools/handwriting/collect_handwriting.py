@@ -11,6 +11,7 @@ from typing import Any
 from lerobot_pf2mp.dataset_tools.handwriting.handwriting_dataset import handwriting_spec
 from lerobot_pf2mp.dataset_tools.handwriting.handwriting_expert import ScriptedHandwritingExpert
 from lerobot_pf2mp.dataset_tools.writing.attempts import successful
+from lerobot_pf2mp.dataset_tools.writing.episodes import check_n_steps
 from lerobot_pf2mp.dataset_tools.writing.write_trajectories import write_trajectories
 from lerobot_pf2mp.envs.handwriting.handwriting_env import HandwritingEnv
 from lerobot_pf2mp.envs.image_size import image_size_of
@@ -48,8 +49,7 @@ def collect_handwriting(
         ValueError: If an argument breaks its rule, or the expert almost never succeeds.
         FileExistsError: If `root` exists and `overwrite` is false.
     """
-    if n_steps < 2:
-        raise ValueError(f"n_steps must be at least 2, got {n_steps}")
+    check_n_steps(n_steps)
     options, image_size = dict(scene_options), None
     if image_width is not None:
         options |= {"render_mode": "rgb_array", "render_size": image_width}

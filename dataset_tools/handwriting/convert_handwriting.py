@@ -15,11 +15,13 @@ from lerobot_pf2mp.dataset_tools.handwriting.handwriting_recording import (
     HandwritingRecording,
     read_handwriting,
 )
-from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory
+from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory, check_n_steps
 from lerobot_pf2mp.dataset_tools.writing.write_trajectories import write_trajectories
 from lerobot_pf2mp.envs.handwriting.handwriting_env import HandwritingEnv
 from lerobot_pf2mp.envs.handwriting.ink import INK_HEIGHT
 from lerobot_pf2mp.envs.handwriting.writing_scene import check_on_sheet
+
+_MOST_FRAMES = 10**6
 
 
 def convert_handwriting(
@@ -31,6 +33,8 @@ def convert_handwriting(
     n_steps: int,
     scene_options: dict[str, Any],
     joint_offsets: Sequence[float] = (),
+    scale: float = 1.0,
+    place: Sequence[float] | None = None,
     n_episodes: int | None = None,
     overwrite: bool = False,
 ) -> tuple[int, Counter[str]]:
@@ -46,7 +50,9 @@ def convert_handwriting(
         repo_id: Its name, ``user/name``.
         n_steps: Steps T that each episode is resampled to.
         scene_options: Arguments of `make_writing_scene`; its regions must not be entered.
-        joint_offsets: Added to the seven joints of the recording [rad].
+        joint_offsets: As for `RecordingFrame`.
+        scale: As for `RecordingFrame`.
+        place: As for `RecordingFrame`.
         n_episodes: Largest number of episodes to write; None writes all.
         overwrite: Whether an existing dataset is replaced.
 
@@ -59,11 +65,11 @@ def convert_handwriting(
         ValueError: If an argument breaks its rule, the recording has another layout or unit, or leaves the sheet or the
             arm's limits, or no episode is usable.
     """
-    if n_steps < 2:
-        raise ValueError(f"n_steps must be at least 2, got {n_steps}")
+    check_n_steps(n_steps)
     env = HandwritingEnv("joint", control="exact", **scene_options)
-    recordings = read_handwriting(path, joint_offsets)
     left_out: Counter[str] = Counter()
+    recordings = read_handwriting(path, joint_offsets, scale=scale, place=place, left_out=left_out)
+    _check_frames(n_steps, len(recordings) if n_episodes is None else min(n_episodes, len(recordings)))
     n_written, dropped = write_trajectories(
         _usable(path, recordings, env, space, n_steps, left_out),
         root=root,
@@ -77,6 +83,15 @@ def convert_handwriting(
         overwrite=overwrite,
     )
     return n_written, dropped + left_out
+
+
+def _check_frames(n_steps: int, n_episodes: int) -> None:
+    """Refuses what would take days: the inverse kinematics of a frame takes about a millisecond."""
+    if n_steps * n_episodes > _MOST_FRAMES:
+        raise ValueError(
+            f"n_steps times the number of episodes must be at most {_MOST_FRAMES}, got {n_steps} x {n_episodes}: choose a "
+            "smaller --n_steps or --n_episodes"
+        )
 
 
 def _usable(

@@ -5,10 +5,13 @@ from __future__ import annotations
 
 from typing import Any
 
+from lerobot_pf2mp.dataset_tools.writing.card import card_header
 from lerobot_pf2mp.dataset_tools.writing.episodes import IMAGE_KEY
 from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, image_feature
 from lerobot_pf2mp.envs.handwriting.panda import JOINT_NAMES
 from lerobot_pf2mp.envs.handwriting.sheet import HANDWRITING_FPS
+
+ROBOT = "panda"
 
 _NAMES = {"joint": list(JOINT_NAMES), "pen": ["x", "y"]}
 _MEANING = {
@@ -17,12 +20,7 @@ _MEANING = {
 }
 
 _CARD = """\
----
-license: apache-2.0
-task_categories: [robotics]
-tags: [LeRobot, pf2mp, handwriting]
----
-# {title}
+{header}# {title}
 
 {description} A Franka Panda writes with a pen in MuJoCo; no demonstration enters a region or touches the table. {origin}
 
@@ -58,6 +56,7 @@ def handwriting_spec(
     """
     description = f"Write {name} without entering a red region."
     card = _CARD.format(
+        header=card_header("handwriting"),
         title=repo_id,
         description=description,
         origin=origin,
@@ -70,4 +69,4 @@ def handwriting_spec(
     features = {"observation.state": feature, "action": dict(feature)}
     if image_size is not None:
         features[IMAGE_KEY] = image_feature(image_size)
-    return DatasetSpec(repo_id, HANDWRITING_FPS, features, description, card)
+    return DatasetSpec(repo_id, HANDWRITING_FPS, features, description, card, ROBOT)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_pf2mp.dataset_tools.writing.card import card_header
 from lerobot_pf2mp.dataset_tools.writing.episodes import IMAGE_KEY, Trajectory, resample
 from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, image_feature
 from lerobot_pf2mp.dataset_tools.writing.write_trajectories import write_trajectories
@@ -18,7 +19,10 @@ from lerobot_pf2mp.envs.maze.point_maze import BALL_RADIUS, make_point_maze
 from lerobot_pf2mp.envs.maze.swept_ball import SweptBall
 from lerobot_pf2mp.envs.tasks import MAZE_OF_TASK
 
+ROBOT = "point_maze"
 FPS = 10
+GOAL_RADIUS = 0.5  # largest distance from its goal at which a demonstration may end [m]
+_LONGEST_STEP = 1.0  # a longer step is no motion, but where two recordings meet [m]
 TASK_DESCRIPTION = "Move the ball to the red goal without touching a wall."
 
 _FEATURES = {
@@ -30,12 +34,7 @@ _FEATURES = {
 _GOAL = "| `observation.environment_state` | position x, y of the goal | m |"
 _IMAGES = "| `observation.image` | the maze from above | |"
 _CARD = """\
----
-license: apache-2.0
-task_categories: [robotics]
-tags: [LeRobot, pf2mp, maze]
----
-# {title}
+{header}# {title}
 
 Start-goal trajectories of a ball in a maze, none of which touches a wall. {origin}
 
@@ -103,6 +102,8 @@ def write_maze_dataset(
         The number of episodes written, and the number of those left out, by reason.
     """
     point_maze, model = make_point_maze(maze)
+    left_out: Counter[str] = Counter()
+    trajectories = _whole(trajectories, left_out)
     features: dict[str, Any] = dict(_FEATURES)
     if image_width is not None:
         image = MazeImage(point_maze.maze.maze_map, image_width)
@@ -110,22 +111,37 @@ def write_maze_dataset(
         del features["observation.environment_state"]
         features[IMAGE_KEY] = image_feature(image.size)
     card = _CARD.format(
+        header=card_header("maze"),
         title=repo_id,
         origin=origin,
         n_steps=n_steps,
         fps=FPS,
         surroundings=_IMAGES if image_width else _GOAL,
     )
-    return write_trajectories(
+    n_written, dropped = write_trajectories(
         trajectories,
         root=root,
-        spec=DatasetSpec(repo_id, FPS, features, TASK_DESCRIPTION, card),
+        spec=DatasetSpec(repo_id, FPS, features, TASK_DESCRIPTION, card, ROBOT),
         n_steps=n_steps,
         collides=SweptBall(model, BALL_RADIUS).collides,
         n_episodes=n_episodes,
         n_expected=n_expected,
         overwrite=overwrite,
     )
+    return n_written, dropped + left_out
+
+
+def _whole(trajectories: Iterable[Trajectory], left_out: Counter[str]) -> Iterator[Trajectory]:
+    """The trajectories that lead to their goal in one piece; counts the others."""
+    for trajectory in trajectories:
+        assert trajectory.goal is not None  # there is one in every maze
+        steps = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
+        if (steps > _LONGEST_STEP).any():
+            left_out["with a jump"] += 1
+        elif np.linalg.norm(trajectory.positions[-1] - trajectory.goal) > GOAL_RADIUS:
+            left_out["far from their goal"] += 1
+        else:
+            yield trajectory
 
 
 def _with_images(trajectories: Iterable[Trajectory], image: MazeImage, n_steps: int) -> Iterator[Trajectory]:

@@ -13,6 +13,10 @@ _EDGE_PADDING = 1e-10
 def compute_stats(values: np.ndarray, lengths: np.ndarray) -> dict[str, np.ndarray]:
     """The statistics of one feature in each of E episodes, equal to those of LeRobot's ``compute_episode_stats``.
 
+    Except for a dimension that is constant in an episode: its standard deviation is 0 and its mean is its value. LeRobot's
+    variance, the mean of the squares minus the square of the mean, is a rounding error of float32 there, which makes up to
+    0.02 of the standard deviation of 1000 frames near 4.8.
+
     LeRobot's function builds a histogram of 5000 bins for each dimension of each episode. This one computes only the few
     entries of the histogram on which the quantiles depend, with the same rounding, for all episodes of one length together.
 
@@ -39,7 +43,8 @@ def compute_stats(values: np.ndarray, lengths: np.ndarray) -> dict[str, np.ndarr
 def aggregate_episodes(stats: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The statistics of one feature over all episodes, equal to those of LeRobot's ``aggregate_feature_stats``.
 
-    Quantiles are the mean of the episodes' quantiles, as in LeRobot.
+    Quantiles are the mean of the episodes' quantiles, as in LeRobot. A dimension that is constant in all episodes has its
+    value as mean, and 0 as standard deviation.
 
     Args:
         stats: The result of `compute_stats`.
@@ -53,13 +58,25 @@ def aggregate_episodes(stats: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         return (values * count).sum(axis=0) / count.sum()
 
     mean = weighted_mean(stats["mean"])
+    return with_exact_constants(
+        {
+            **{name: weighted_mean(values) for name, values in stats.items() if name.startswith("q")},
+            "min": stats["min"].min(axis=0),
+            "max": stats["max"].max(axis=0),
+            "mean": mean,
+            "std": np.sqrt(weighted_mean(stats["std"] ** 2 + (stats["mean"] - mean) ** 2)),
+            "count": count.sum(axis=0),
+        }
+    )
+
+
+def with_exact_constants(stats: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """LeRobot's statistics ``(D,)`` of one feature, with the mean and the standard deviation that a constant has."""
+    is_constant = stats["min"] == stats["max"]
     return {
-        **{name: weighted_mean(values) for name, values in stats.items() if name.startswith("q")},
-        "min": stats["min"].min(axis=0),
-        "max": stats["max"].max(axis=0),
-        "mean": mean,
-        "std": np.sqrt(weighted_mean(stats["std"] ** 2 + (stats["mean"] - mean) ** 2)),
-        "count": count.sum(axis=0),
+        **stats,
+        "mean": np.where(is_constant, stats["min"], stats["mean"]),
+        "std": np.where(is_constant, 0.0, stats["std"]),
     }
 
 
@@ -68,11 +85,13 @@ def _stats_of_equally_long(frames: np.ndarray) -> dict[str, np.ndarray]:
     n_episodes, n_frames, _ = frames.shape
     low, high, mean = frames.min(axis=1), frames.max(axis=1), frames.mean(axis=1)
     variance = (frames**2).mean(axis=1) - mean**2
+    is_constant = low == high
+    mean = np.where(is_constant, low, mean)
     stats = {
         "min": low,
         "max": high,
         "mean": mean,
-        "std": np.sqrt(np.maximum(variance, 0)) if n_frames > 1 else np.zeros_like(mean),
+        "std": np.sqrt(np.where(is_constant, 0, np.maximum(variance, 0))),
         "count": np.full((n_episodes, 1), n_frames),
     }
     names = [f"q{int(share * 100):02d}" for share in DEFAULT_QUANTILES]

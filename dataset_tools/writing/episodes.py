@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 MIN_STEPS = 2
+_MOST_STEPS = 10**5  # of an episode; more is a slip of the keyboard, and would need more memory than there is
 IMAGE_KEY = "observation.image"
 
 
@@ -33,6 +34,18 @@ class Trajectory:
     def n_steps(self) -> int:
         """The number N of steps."""
         return len(self.positions) - 1
+
+
+def check_n_steps(n_steps: int) -> None:
+    """Checks the number of steps that episodes are to have.
+
+    Raises:
+        ValueError: If it is below 2 or above 100 000.
+    """
+    if n_steps < MIN_STEPS:
+        raise ValueError(f"n_steps must be at least {MIN_STEPS}, got {n_steps}")
+    if n_steps > _MOST_STEPS:
+        raise ValueError(f"n_steps must be at most {_MOST_STEPS}, got {n_steps}")
 
 
 def resample(positions: np.ndarray, n_steps: int) -> np.ndarray:

@@ -41,6 +41,7 @@ class DatasetSpec:
         features: LeRobot's feature dictionary of the columns that episodes provide, all numeric.
         task: Description of the task in words.
         card: Text of its README.md.
+        robot_type: Name of the robot; None if it is unknown.
     """
 
     repo_id: str
@@ -48,6 +49,7 @@ class DatasetSpec:
     features: dict[str, dict[str, Any]]
     task: str
     card: str
+    robot_type: str | None = None
 
 
 def write_dataset(
@@ -58,6 +60,14 @@ def write_dataset(
     Statistics and metadata are computed for many episodes in one call. Each episode is one row group of a parquet file, as
     in the datasets of LeRobot's recorder. Memory holds `_BATCH_FRAMES` frames, and parquet's index of the row groups of the
     current file, 14 kB for each episode.
+
+    It differs from LeRobot's recorder in three respects:
+
+    - Statistics of a dimension that is constant, in an episode or in all, are exact, see `compute_stats`.
+    - Statistics of all episodes are computed at the end of each batch, not one episode after the other, which rounds in
+      another order; columns of the episodes' metadata are in another order, which no reader depends on.
+    - The card is that of the specification, because LeRobot's says nothing about the data. Its first lines tell `datasets`
+      where the frames are, as those of LeRobot's do.
 
     Args:
         root: The dataset's folder.
@@ -74,7 +84,12 @@ def write_dataset(
     """
     with written_beside(root, overwrite, kind="dataset", mark="meta/info.json", option="--root") as partial:
         meta = LeRobotDatasetMetadata.create(
-            spec.repo_id, fps=spec.fps, features=spec.features, root=partial, use_videos=False
+            spec.repo_id,
+            fps=spec.fps,
+            features=spec.features,
+            robot_type=spec.robot_type,
+            root=partial,
+            use_videos=False,
         )
         meta.save_episode_tasks([spec.task])
         with (

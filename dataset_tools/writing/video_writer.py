@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 from lerobot.datasets import LeRobotDataset
+from lerobot.datasets.io_utils import write_stats
 
+from lerobot_pf2mp.dataset_tools.writing.episode_stats import with_exact_constants
 from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec
 from lerobot_pf2mp.process.atomic_files import written_beside
 
@@ -23,11 +25,17 @@ def write_video_dataset(
 ) -> int:
     """Writes episodes with images; the arguments, the result and the errors are those of `write_dataset`.
 
+    Statistics are those of LeRobot, except for what is constant in all episodes, which is exact as in `write_dataset`.
     Features of dtype ``video`` take ``(T, H, W, 3)`` uint8 images.
     """
     with written_beside(root, overwrite, kind="dataset", mark="meta/info.json", option="--root") as partial:
         dataset = LeRobotDataset.create(
-            spec.repo_id, spec.fps, spec.features, root=partial, streaming_encoding=True
+            spec.repo_id,
+            spec.fps,
+            spec.features,
+            robot_type=spec.robot_type,
+            root=partial,
+            streaming_encoding=True,
         )
         n_written = 0
         try:
@@ -44,5 +52,6 @@ def write_video_dataset(
             if dataset.has_pending_frames():
                 dataset.clear_episode_buffer()
             dataset.finalize()
+        write_stats({key: with_exact_constants(stats) for key, stats in dataset.meta.stats.items()}, partial)
         (partial / "README.md").write_text(spec.card, encoding="utf-8")
     return n_written

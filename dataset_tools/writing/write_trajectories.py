@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory, prepare
+from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory, check_n_steps, prepare
 from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, write_dataset
 from lerobot_pf2mp.dataset_tools.writing.video_writer import has_images, write_video_dataset
 
@@ -47,8 +47,7 @@ def write_trajectories(
         ValueError: If an argument breaks its rule or no trajectory is usable.
         FileExistsError: If `root` exists and `overwrite` is false.
     """
-    if n_steps < 2:
-        raise ValueError(f"n_steps must be at least 2, got {n_steps}")
+    check_n_steps(n_steps)
     if n_episodes is not None and n_episodes < 1:
         raise ValueError(f"n_episodes must be at least 1, got {n_episodes}")
     dropped: Counter[str] = Counter()

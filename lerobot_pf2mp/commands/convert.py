@@ -11,7 +11,14 @@ from lerobot_pf2mp.commands.command import write_and_report
 from lerobot_pf2mp.commands.publishing import published_if_asked
 from lerobot_pf2mp.commands.scene import SceneConfig
 from lerobot_pf2mp.commands.writing import WritingConfig
-from lerobot_pf2mp.envs.tasks import FETCH_OF_TASK, FETCH_STEPS, HANDWRITING_STEPS, MAZE_STEPS, SPACE_OF_TASK
+from lerobot_pf2mp.envs.tasks import (
+    FETCH_OF_TASK,
+    FETCH_STEPS,
+    HANDWRITING_STEPS,
+    MAZE_OF_TASK,
+    MAZE_STEPS,
+    SPACE_OF_TASK,
+)
 
 
 @dataclass
@@ -19,14 +26,19 @@ class SourceConfig:
     """The source of recorded demonstrations."""
 
     # Layout of the recording: d4rl (maze2d, one HDF5 file), minari (pointmaze, a folder), fetch (gymnasium-robotics'
-    # FetchReach or FetchPush: an npz file, or the folder of a Minari dataset) or handwriting (a CSV or JSON file, or the
-    # folder of a LeRobotDataset with joint actions).
+    # FetchReach or FetchPush: an npz file, or the folder of a Minari dataset) or handwriting (a CSV, TSV, JSON or JSONL
+    # file, or the folder of a LeRobotDataset with joint actions).
     type: str = "d4rl"
     # The file or folder.
     path: Path | None = None
     # Handwriting: seven angles to add to the recorded joints [rad], if the arm has other zero positions:
     # [0,0,0,0,0,-1.5708,-0.7854] for a real Panda.
     joint_offsets: list[float] = field(default_factory=list)
+    # Handwriting: length of the unit in which positions of the pen were recorded [m]: 0.001 for millimetres.
+    scale: float = 1.0
+    # Handwriting: where x = y = 0 of the recorded positions of the pen lies in the frame of the arm's base [m], for example
+    # [0.34,-0.16], the sheet's corner on the right of the arm. By default the recording is in that frame already.
+    place: list[float] | None = None
 
 
 @dataclass
@@ -41,6 +53,8 @@ class ConvertConfig(WritingConfig):
         pf2mp-convert --source.type=fetch --source.path=~/.minari/datasets/fetch/push-v0 --task=fetch_push \
 --scene.wall_position=[1.30,0.80] --root=data/push
         pf2mp-convert --source.type=handwriting --source.path=strokes.csv --task=handwriting_pen --root=data/mine
+        pf2mp-convert --source.type=handwriting --source.path=tablet.csv --source.scale=0.001 --source.place=[0.34,-0.16] \
+--task=handwriting_joint --root=data/tablet
         pf2mp-convert --source.type=handwriting --source.path=data/teleoperated --task=handwriting_joint \
 --scene_file=my_stroke.json --root=data/mine
 
@@ -51,8 +65,18 @@ class ConvertConfig(WritingConfig):
     episode is its goal. Episodes that do not end within 0.05 m of it are left out.
 
     CSV files of handwriting have columns time [s], optionally episode, and joint_1 to joint_7 [rad], optionally finger_1
-    and finger_2 [m], or x and y of the pen [m]. JSON files are {"episodes": [{"time": [...], "joints": [[7 or 9], ...]}]} or
-    "pen": [[x, y], ...] instead. Of a LeRobotDataset the actions are used: 7 joints, or 7 joints and 2 fingers.
+    and finger_2 [m], or x and y of the pen [m]. Other usual names are understood (timestamp, %time, t; panda_joint1, joint1,
+    q1), and semicolons, tabs and decimal commas. JSON files are {"episodes": [{"time": [...], "joints": [[7 or 9], ...]}]}
+    or "pen": [[x, y], ...] instead; JSONL files have such an episode, or a sample {"time": 0.1, "x": 0.5, "y": 0.1}, in each
+    line. Of a LeRobotDataset the actions are used, by their names: 7 joints, or 7 joints and 2 fingers.
+
+    A demonstration of handwriting is one stroke. Columns pen_down, pen_up, pressure or z (height of the pen above the table)
+    tell where the pen is lifted: what comes before the stroke and after it is left out, and so are episodes in which the pen
+    is lifted in between, in which the times do not increase, or with fewer than 3 samples.
+
+    Trajectories of a maze end where timeouts or terminals of D4RL say so, and where the goal changes. Those that end more
+    than 0.5 m from their goal, cut off, are left out. A recording in another maze is refused; a maze that no task has is
+    taken from a Minari dataset that names it.
     """
 
     # The recording.
@@ -108,11 +132,18 @@ def _convert_maze(config: ConvertConfig, path: Path) -> None:
                 f"--source.type must be {source_type} for {config.task}, got {config.source.type!r}"
             )
     from lerobot_pf2mp.dataset_tools.maze.convert_d4rl import read_d4rl
-    from lerobot_pf2mp.dataset_tools.maze.convert_minari import read_minari
+    from lerobot_pf2mp.dataset_tools.maze.convert_minari import read_minari, recorded_maze
     from lerobot_pf2mp.dataset_tools.maze.maze_dataset import maze_of, write_maze_dataset
+    from lerobot_pf2mp.dataset_tools.maze.maze_recognition import maze_of_recording
 
-    maze = maze_of(config.task, config.maze_map)
-    n_expected, trajectories = read_d4rl(path, maze) if config.source.type == "d4rl" else read_minari(path)
+    chosen = maze = maze_of(config.task, config.maze_map)
+    if config.source.type == "d4rl":
+        n_expected, trajectories = read_d4rl(path, maze)
+    elif (recorded := recorded_maze(path)) is None:
+        n_expected, trajectories = read_minari(path, maze)
+    else:
+        maze = maze_of_recording(recorded, chosen, config.maze_map is not None, path)
+        n_expected, trajectories = read_minari(path)
     write = partial(
         write_maze_dataset,
         trajectories,
@@ -121,7 +152,7 @@ def _convert_maze(config: ConvertConfig, path: Path) -> None:
         n_episodes=config.n_episodes,
         n_expected=n_expected,
     )
-    write_and_report(config, "maze" if config.maze_map else config.task, MAZE_STEPS, write)
+    write_and_report(config, config.task if maze in MAZE_OF_TASK.values() else "maze", MAZE_STEPS, write)
 
 
 def _convert_fetch(config: ConvertConfig, path: Path) -> None:
@@ -150,6 +181,8 @@ def _convert_handwriting(config: ConvertConfig, path: Path) -> None:
         SPACE_OF_TASK[config.task],
         scene_options=config.scene_options,
         joint_offsets=config.source.joint_offsets,
+        scale=config.source.scale,
+        place=config.source.place,
         n_episodes=config.n_episodes,
     )
     write_and_report(config, config.task, HANDWRITING_STEPS, write)

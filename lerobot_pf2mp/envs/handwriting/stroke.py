@@ -20,11 +20,11 @@ def evenly_spaced(points: np.ndarray, spacing: float) -> np.ndarray:
         points: ``(N, 2)`` corners of the line.
         spacing: Distance between neighbours, in the unit of the points.
     """
-    line = line_of(points)
-    if isinstance(line, Point):
+    if (points == points[0]).all():
         return points[:1]
-    n = max(1, round(line.length / spacing))
-    return shapely.get_coordinates(line.interpolate(np.linspace(0.0, 1.0, n + 1), normalized=True))
+    lengths = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    at = np.linspace(0.0, lengths[-1], max(1, round(lengths[-1] / spacing)) + 1)
+    return np.stack([np.interp(at, lengths, column) for column in points.T], axis=1)
 
 
 def distances(points: np.ndarray, stroke: np.ndarray) -> np.ndarray:

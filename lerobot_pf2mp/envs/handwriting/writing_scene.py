@@ -28,7 +28,7 @@ SHEET_CORNERS = np.array(SHEET_CENTRE) - SHEET_SIDE / 2, np.array(SHEET_CENTRE) 
 _SPACING = 0.001  # between the letter's points [m]
 _RADII = (0.006, 0.045)  # smallest and largest of a letter's regions [m]
 _GRID = 0.002  # spacing of the candidate centres of regions [m]
-_MIN_LENGTH = 0.02  # smallest length of a stroke [m]
+_LENGTHS = (0.02, 100.0)  # smallest and largest length of a stroke [m]
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,7 @@ class WritingScene:
 
     def __post_init__(self) -> None:
         check_on_sheet(self.stroke, f"the stroke of {self.name}")
-        if line_of(self.stroke).length < _MIN_LENGTH:
-            raise ValueError(f"a stroke must be at least {_MIN_LENGTH} m long, got that of {self.name}")
+        _check_length(self.stroke, self.name)
         for region in self.regions:
             if region.clearance(self.stroke) <= 0:
                 raise ValueError(
@@ -76,14 +75,32 @@ def check_on_sheet(positions: np.ndarray, name: str) -> None:
         ValueError: If one is not finite or not on the sheet.
     """
     if positions.ndim < 1 or positions.shape[-1] != 2 or not np.isfinite(positions).all():
-        raise ValueError(f"{name} must be finite positions x, y [m], got {positions.tolist()}")
-    if not is_on_sheet(positions):
-        low, high = SHEET_CORNERS
-        outside = next(position for position in positions.reshape(-1, 2) if not is_on_sheet(position))
+        raise ValueError(f"{name} must be finite positions x, y [m], got {_first_not_finite(positions)}")
+    low, high = SHEET_CORNERS
+    is_outside = ((positions < low) | (positions > high)).any(axis=-1)
+    if is_outside.any():
+        row = int(is_outside.argmax())
+        outside = positions.reshape(-1, 2)[row]
         raise ValueError(
             f"{name} must lie on the sheet, where the arm reaches with an upright pen, x in [{low[0]:g}, {high[0]:g}] "
             f"and y in [{low[1]:g}, {high[1]:g}] m of its base; got {np.round(outside, 4).tolist()}"
+            f"{f' in row {row}' if positions.ndim > 1 else ''}"
         )
+
+
+def _check_length(stroke: np.ndarray, name: str) -> None:
+    length = line_of(stroke).length
+    if length < _LENGTHS[0]:
+        raise ValueError(f"a stroke must be at least {_LENGTHS[0]} m long, got that of {name}")
+    if length > _LENGTHS[1]:
+        raise ValueError(f"a stroke must be at most {_LENGTHS[1]:g} m long, got {length:g} m, that of {name}")
+
+
+def _first_not_finite(positions: np.ndarray) -> str:
+    if positions.ndim < 1 or positions.shape[-1] != 2:
+        return f"an array of shape {positions.shape}"
+    row = int((~np.isfinite(positions)).any(axis=-1).argmax())
+    return f"{positions.reshape(-1, 2)[row].tolist()}{f' in row {row}' if positions.ndim > 1 else ''}"
 
 
 def make_writing_scene(
@@ -137,7 +154,7 @@ def read_writing_scene(path: Path) -> WritingScene:
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} must be a JSON file, got {error}") from error
     if not isinstance(content, dict) or set(content) - {"regions"} != {"stroke"}:
         found = list(content) if isinstance(content, dict) else type(content).__name__
@@ -147,6 +164,7 @@ def read_writing_scene(path: Path) -> WritingScene:
         raise ValueError(f"the regions in {path} must be a list, got {regions}")
     positions = _stroke_of(content["stroke"], path)
     check_on_sheet(positions, f"the stroke of {path.stem}")
+    _check_length(positions, path.stem)  # before it is divided into millimetres
     stroke = evenly_spaced(positions, _SPACING)
     return WritingScene(path.stem, stroke, tuple(region_of(region) for region in regions))
 
@@ -154,7 +172,7 @@ def read_writing_scene(path: Path) -> WritingScene:
 def _stroke_of(content: Any, path: Path) -> np.ndarray:
     try:
         positions = np.array(content, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         positions = np.empty(0)
     if (
         positions.ndim != 2
