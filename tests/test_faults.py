@@ -55,8 +55,8 @@ def test_no_run_deletes_a_dataset_that_it_did_not_see(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--n_steps=1000000000",), "n_steps must be at most 10000, got 1e+09"),
-        (("--task=handwriting_pen", "--n_steps=1000000000"), "n_steps must be at most 10000"),
+        (("--n_steps=1000000000",), "n_steps must be at most 100000, got 1e+09"),
+        (("--task=handwriting_pen", "--n_steps=1000000000"), "n_steps must be at most 100000"),
         (("--obs_type=pixels_agent_pos", "--image_width=1000000000"), "image_width must be at most 8192"),
         (
             ("--obs_type=pixels_agent_pos", "--picture_width=1000000000000"),

@@ -180,7 +180,7 @@ def test_a_file_that_does_not_exist_or_is_no_file_is_named(tmp_path: Path) -> No
         ("--options=!!python/object/apply:os.system ['id']", "--options must be plain YAML"),
         ("--seed=[", "--seed must be plain YAML, got '\\['"),
         ("--inner.offsets=[null, 0]", r"inner.offsets\[0\] must be float, got null"),
-        ("--n_steps=1000000000", "n_steps must be at most 10000, got 1e[+]09"),
+        ("--n_steps=1000000000", "n_steps must be at most 100000, got 1e[+]09"),
         ("--n_steps=1e9", "`n_steps`: Couldn't parse '1e9' into an int"),
     ],
 )

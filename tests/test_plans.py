@@ -4,11 +4,14 @@
 import copy
 import logging
 import math
+from dataclasses import fields
 from typing import Any
 
 import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
+from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 from torch import Tensor
 
 from lerobot_pf2mp import DPPFConfig, FMPConfig, PF2MPConfig
@@ -475,9 +478,10 @@ def test_without_guidance_and_other_plans_nothing_changes(kind: str) -> None:
         plain = policy_of("fmp")
         plain.load_state_dict(guided.state_dict())
     else:
-        from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
-
-        plain = DiffusionPolicy(guided.config).eval()
+        own = {
+            field.name: getattr(guided.config, field.name) for field in fields(DiffusionConfig) if field.init
+        }
+        plain = DiffusionPolicy(DiffusionConfig(**own)).eval()
         plain.load_state_dict(guided.state_dict())
     observation = {key: value for key, value in batch.items() if key != POTENTIAL_FIELD}
     if kind == "dppf":

@@ -18,6 +18,7 @@ from torch.utils.data import DataLoader
 
 from lerobot_pf2mp import PF2MPConfig
 from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, write_dataset
+from lerobot_pf2mp.errors import ConfigError
 from lerobot_pf2mp.training.in_memory_dataset import InMemoryDataset
 from lerobot_pf2mp.training.run_dataset import find_dataset, run_episodes
 
@@ -78,10 +79,18 @@ def test_the_run_learns_from_the_episodes_that_evaluation_does_not_hold_out(root
 
 
 def test_a_streaming_dataset_is_found(root):
-    dataset, _ = run_on(root, streaming=True, episodes=[0, 1])
+    dataset, _ = run_on(root, streaming=True)
     assert type(dataset) is StreamingLeRobotDataset
     assert find_dataset(dataset.meta) is dataset
-    assert run_episodes(dataset.meta) == [0, 1]
+    assert run_episodes(dataset.meta) is None
+
+
+def test_episodes_of_a_streaming_dataset_are_refused_because_lerobot_reads_all_of_them(root):
+    dataset = StreamingLeRobotDataset(NAME, root=root, episodes=[0, 1])
+    with pytest.raises(
+        ConfigError, match="dataset.episodes must be unset with --dataset.streaming=true.*got 2 of 5"
+    ):
+        run_episodes(dataset.meta)
 
 
 def test_a_dataset_is_found_inside_pf2mp_trains_and_accelerates_wrappings(root):

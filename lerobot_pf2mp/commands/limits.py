@@ -12,7 +12,7 @@ LIMITS: dict[str, float] = {
     "n_processes": 256,
     "n_regions": 1000,
     "n_repeats": 10_000,
-    "n_steps": 10_000,
+    "n_steps": 100_000,
     "port": 65_535,
     "save_freq": 10**12,
     "seed": 2**31 - 1,
