@@ -23,7 +23,7 @@ bench: .venv-bench/installed
 	.venv-bench/bin/python tests/benchmarks
 
 tables:
-	.ci/fill_tables README.md results/ABLATIONS.md results/BENCHMARKS.md
+	.ci/fill_tables README.md results/ABLATIONS.md results/BENCHMARKS.md results/FAULTS.md
 
 clean:
 	rm -rf .venv .venv-bench demo build *.egg-info

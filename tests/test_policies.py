@@ -10,9 +10,10 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
 from torch import Tensor
 
-from lerobot_pf2mp import FMPConfig, PF2MPConfig, PotentialFieldProcessorStep
+from lerobot_pf2mp import DPPFConfig, FMPConfig, PF2MPConfig, PotentialFieldProcessorStep
 from lerobot_pf2mp.errors import ConfigError
 from lerobot_pf2mp.policies.batch_keys import POTENTIAL_FIELD
+from lerobot_pf2mp.policies.dppf.modeling_dppf import DPPFPolicy
 from lerobot_pf2mp.policies.fmp.fused_adamw import FusedAdamWConfig
 from lerobot_pf2mp.policies.fmp.modeling_fmp import FMPPolicy
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
@@ -896,3 +897,46 @@ def test_a_field_dimension_that_the_action_does_not_have_is_an_error():
         ValueError, match=r"field_action_dims must be below the action dimension 2, got \(0, 2\)"
     ):
         pf2mp(field_action_dims=(0, 2))
+
+
+@pytest.mark.parametrize("kind", ["fmp", "dppf"])
+def test_images_of_another_size_than_the_policy_was_made_for_are_named(kind: str) -> None:
+    camera = "observation.images.front"
+    options: dict[str, Any] = {
+        "device": "cpu",
+        "horizon": 8,
+        "n_action_steps": 4,
+        "n_obs_steps": 1,
+        "down_dims": (8, 16),
+        "n_groups": 4,
+        "diffusion_step_embed_dim": 16,
+        "pretrained_backbone_weights": None,
+        "use_group_norm": True,
+        "spatial_softmax_num_keypoints": 4,
+        "input_features": {
+            "observation.state": PolicyFeature(FeatureType.STATE, (2,)),
+            camera: PolicyFeature(FeatureType.VISUAL, (3, 64, 64)),
+        },
+        "output_features": {"action": PolicyFeature(FeatureType.ACTION, (2,))},
+    }
+    config_class, policy_class = (FMPConfig, FMPPolicy) if kind == "fmp" else (DPPFConfig, DPPFPolicy)
+    batch = {"observation.state": torch.zeros(1, 2), camera: torch.rand(1, 3, 96, 96)}
+    unguided: dict[str, Any] = {} if kind == "fmp" else {"max_plans": 1, "guidance_scale": 0.0}
+    for more, fits in (({}, False), ({"resize_shape": (64, 64)}, True), ({"crop_shape": (56, 56)}, True)):
+        policy = policy_class(config_class(**{**options, "crop_shape": None, **unguided, **more})).eval()
+        if fits:
+            assert policy.select_action(dict(batch)).shape == (1, 2)
+            continue
+        with pytest.raises(ValueError, match=f"images of {camera} must be of 64 x 64 pixels.*got 96 x 96"):
+            policy.select_action(dict(batch))
+
+
+def test_dppf_says_that_it_needs_more_than_the_state() -> None:
+    features = {"observation.state": PolicyFeature(FeatureType.STATE, (2,))}
+    config = DPPFConfig(
+        input_features=features, output_features={"action": PolicyFeature(FeatureType.ACTION, (2,))}
+    )
+    with pytest.raises(
+        ValueError, match=r"must hold a camera or observation.environment_state.*type pf2mp take"
+    ):
+        DPPFPolicy(config)

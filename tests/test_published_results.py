@@ -33,7 +33,9 @@ def test_the_table_of_the_demo_is_made_from_its_rows() -> None:
         assert line == f"| {row.policy} | {rates[0]} | {rates[1]} | {row.n_episodes} |"
 
 
-@pytest.mark.parametrize("page", ["README.md", "results/ABLATIONS.md", "results/BENCHMARKS.md"])
+@pytest.mark.parametrize(
+    "page", ["README.md", "results/ABLATIONS.md", "results/BENCHMARKS.md", "results/FAULTS.md"]
+)
 def test_pages_show_the_tables_as_they_are(page: str, tmp_path: Path) -> None:
     copy = tmp_path / "page.md"
     shutil.copy(ROOT / page, copy)

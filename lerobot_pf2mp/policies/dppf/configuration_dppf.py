@@ -53,6 +53,11 @@ class DPPFConfig(GuidedConfig, DiffusionConfig):
             ConfigError: If LeRobot's own `DiffusionPolicy` is opened with this configuration. It would be unguarded.
         """
         _refuse_other_policies()
+        if not self.image_features and self.env_state_feature is None:
+            raise ValueError(
+                "a dppf policy's inputs must hold a camera or observation.environment_state, as LeRobot's Diffusion Policy, "
+                f"got {list(self.input_features or {})}. Policies of type pf2mp take observation.state alone"
+            )
         super().validate_features()
         self._validate_field_dims(self.action_feature)
 

@@ -16,6 +16,7 @@ from lerobot_pf2mp.flow_matching import Guide
 from lerobot_pf2mp.policies.checked_loading import require_own_config
 from lerobot_pf2mp.policies.dppf.configuration_dppf import DPPFConfig
 from lerobot_pf2mp.policies.guided.field_guidance import FieldGuidance
+from lerobot_pf2mp.policies.image_sizes import check_image_sizes
 from lerobot_pf2mp.policies.own_policy import OwnPolicy
 from lerobot_pf2mp.policies.plans.plans import Plans
 
@@ -53,6 +54,7 @@ class DPPFPolicy(OwnPolicy, DiffusionPolicy):
         """The loss of `DiffusionPolicy`. In training it also adds the batch's actions to the potential field."""
         if self.training and torch.is_grad_enabled():
             self.guidance.observe(batch)
+        check_image_sizes(self.config, batch)
         return super().forward(batch, *args, **kwargs)
 
     @torch.no_grad()
@@ -72,6 +74,7 @@ class DPPFPolicy(OwnPolicy, DiffusionPolicy):
                 dimensions, or one without demonstrated plans; or if an action is not finite.
             UnsupportedPlanError: With ``on_unsupported=stop``, if no plan stays in the demonstrated region.
         """
+        check_image_sizes(self.config, batch)
         self.guidance.begin()
         guide = guide or self.guidance.guide(batch, next(self.parameters()).device)
         window = self._with_window(batch)

@@ -21,6 +21,7 @@ from lerobot_pf2mp.policies.fmp.configuration_fmp import FMPConfig
 from lerobot_pf2mp.policies.fmp.ema import MovingAverage
 from lerobot_pf2mp.policies.fmp.networks import VelocityNetwork
 from lerobot_pf2mp.policies.fmp.real_time_chunking import continuing
+from lerobot_pf2mp.policies.image_sizes import check_image_sizes
 from lerobot_pf2mp.policies.own_policy import OwnPolicy
 from lerobot_pf2mp.policies.plans.plans import require_finite
 
@@ -311,7 +312,12 @@ class FMPPolicy(OwnPolicy, PreTrainedPolicy):
         return window
 
     def _stack_cameras(self, batch: dict[str, Any]) -> Tensor:
-        """The cameras' images as ``(B, [n_obs_steps,] n_cameras, C, H, W)``."""
+        """The cameras' images as ``(B, [n_obs_steps,] n_cameras, C, H, W)``.
+
+        Raises:
+            ValueError: If they are of another size than the policy was made for.
+        """
+        check_image_sizes(self.config, batch)
         return torch.stack([batch[key] for key in self.config.image_features], dim=-4)
 
 
