@@ -46,5 +46,8 @@ def explained(what: str) -> Iterator[None]:
 
 def _message_of(error: Exception) -> str:
     text = str(error) or type(error).__name__
-    # LeRobot reports "not found on the Hub" for every error of the Hub, for example a missing login. The cause says more.
-    return f"{text}: {error.__cause__}" if isinstance(error.__cause__, HfHubHTTPError) else text
+    # LeRobot reports "not found on the Hub" for every error of the Hub, for example a missing login, and datasets "an error
+    # occurred" for a full disk. The cause says more.
+    cause = error.__cause__
+    is_told = isinstance(cause, HfHubHTTPError) or (isinstance(cause, OSError) and str(cause) not in text)
+    return f"{text}: {cause}" if is_told else text

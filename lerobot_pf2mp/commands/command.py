@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from draccus.utils import ParsingError
+from safetensors import SafetensorError
 
 from lerobot_pf2mp import __version__
 from lerobot_pf2mp.commands.options import parse
@@ -72,7 +73,15 @@ def errors_in_one_line() -> Iterator[None]:
     except MemoryError as error:
         print("error: there is not enough memory:", one_line(error) or "it is full", file=sys.stderr)
         sys.exit(1)
-    except (ParsingError, ArgumentError, ValueError, RuntimeError, OSError, ImportError) as error:
+    except (
+        ParsingError,
+        ArgumentError,
+        SafetensorError,  # also for a full disk
+        ValueError,
+        RuntimeError,
+        OSError,
+        ImportError,
+    ) as error:
         print("error:", one_line(error), file=sys.stderr)
         sys.exit(1)
     except Exception:
