@@ -145,6 +145,7 @@ def change_field(name: str, value: float) -> Callable[[Path], None]:
     [
         (change_config("num_inference_steps", 10**9), "num_inference_steps must be at most 10000"),
         (change_config("horizon", 8 * 10**30), "horizon must be at most 10000"),
+        (change_config("horizon", -(10**30)), "horizon must be at least 1"),
         (change_config("horizon", None), "horizon must be an integer, got null"),
         (change_config("n_action_steps", 2.5), "`n_action_steps`: Couldn't parse '2.5' into an int"),
         (change_config("max_plans", None), "max_plans must be an integer, got null"),
@@ -162,10 +163,11 @@ def change_field(name: str, value: float) -> Callable[[Path], None]:
         (change_field("points", 1e30), r"must hold finite points \(P, D\), below 1e[+]12"),
     ],
 )
+@pytest.mark.parametrize("kind", ["pf2mp", "dppf"])
 def test_giant_and_missing_numbers_of_a_checkpoint(
-    change: Callable[[Path], None], said: str, tmp_path: Path
+    kind: str, change: Callable[[Path], None], said: str, tmp_path: Path
 ) -> None:
-    checkpoint = Path(write_checkpoint(tmp_path / "policy", "pf2mp"))
+    checkpoint = Path(write_checkpoint(tmp_path / "policy", kind))
     change(checkpoint)
     with pytest.raises(ValueError, match=said):
         load_policy(checkpoint)

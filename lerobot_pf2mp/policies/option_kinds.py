@@ -54,6 +54,14 @@ def check_kinds_and_sizes(config: Any) -> None:
                 raise ValueError(f"{name} must be at most {LARGEST[name]}, got {value}")
 
 
+def is_of_kind(value: Any, hint: Any) -> bool:
+    """Whether a value is of a type hint's kind, if that is a number, switch or text, or null; true for other hints."""
+    kinds = set(_leaves(hint))
+    if not kinds <= {int, float, bool, str, type(None)} or typing.get_origin(hint) in (tuple, list):
+        return True
+    return any(_is_of(value, kind) for kind in kinds)
+
+
 @cache
 def _kinds_of(config_class: Any) -> tuple[tuple[str, frozenset[type]], ...]:
     """The options that are numbers or switches, or tuples of them, with the kinds that they may have."""

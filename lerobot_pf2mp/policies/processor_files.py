@@ -22,6 +22,8 @@ from huggingface_hub import hf_hub_download
 from huggingface_hub.errors import EntryNotFoundError
 from lerobot.processor import ProcessorStepRegistry
 
+from lerobot_pf2mp.policies.option_kinds import is_of_kind
+
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
 
 # Classes of steps, separated by commas, that may be loaded although they are not registered.
@@ -129,6 +131,8 @@ def _check_values(name: str | None, values: Any, shown: str) -> None:
                 f"{option} of {name!r} in {shown} must be {'a mapping' if is_mapping else 'a value'}, got "
                 f"{'null' if value is None else _shortened(value)}"
             )
+        if not is_of_kind(value, hint):
+            raise ValueError(f"{option} of {name!r} in {shown} must be {hint}, got {_shortened(value)}")
 
 
 def _shortened(value: Any) -> str:

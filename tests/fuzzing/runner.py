@@ -119,16 +119,21 @@ def _raise_hang(*_: object) -> None:
 
 
 def _run_one(target: str, make: Make, number: int, seed: int, folder: Path, keep: Path) -> Outcome:
-    rng = random.Random(f"{seed}/{target}/{number}")
     here = folder / "a/b"  # ../x lies within the folder
-    here.mkdir(parents=True)
-    os.chdir(here)
     os.environ["HOME"] = str(folder)
     os.environ[MARKER] = str(folder / MARKER)
-    try:
-        call = make(rng, here)
-    except Exception as error:  # a mutation that its library refuses is no input
-        return Outcome(target, number, "usage", f"no input: {error}"[:200], 0.0)
+    for attempt in range(100):
+        rng = random.Random(f"{seed}/{target}/{number}/{attempt}")
+        shutil.rmtree(here, ignore_errors=True)
+        here.mkdir(parents=True)
+        os.chdir(here)
+        try:
+            call = make(rng, here)
+            break
+        except (TypeError, ValueError, OSError, KeyError, RuntimeError):
+            continue  # a change that the file's own library refuses is no input
+    else:
+        raise AssertionError(f"{target} has no inputs")
     before = _hidden(folder)
     output = folder / "said"
     began = time.monotonic()

@@ -304,7 +304,7 @@ TARGETS: dict[str, tuple[Callable[[Path], Make], float]] = {
     "config.json": (fuzz_checkpoint("config.json"), 2),
     "processors' JSON": (fuzz_checkpoint("policy_*processor.json"), 2),
     "field": (fuzz_checkpoint("*potential_field.safetensors"), 2),
-    "weights and statistics": (fuzz_checkpoint("*er.safetensors"), 0.5),
+    "weights and statistics": (fuzz_checkpoint("*[lr].safetensors"), 0.5),
     "result CSV": (fuzz_results, 1),
     "run.json, episodes.csv": (fuzz_run, 0.5),
     "scene file": (fuzz_scene, 1),

@@ -37,6 +37,16 @@ class DPPFConfig(GuidedConfig, DiffusionConfig):
         """
         with reported_on_the_command_line():
             check_kinds_and_sizes(self)
+            for name in (
+                "horizon",
+                "n_obs_steps",
+                "n_action_steps",
+                "num_train_timesteps",
+                "n_groups",
+                "kernel_size",
+            ):
+                if getattr(self, name) < 1:
+                    raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
             super().__post_init__()
             self._validate_guidance()
             n_steps = self.num_inference_steps
