@@ -27,6 +27,7 @@ from lerobot_pf2mp.envs.maze.maze_env import SUCCESS_RADIUS
 from lerobot_pf2mp.envs.maze.point_maze import BALL_RADIUS, make_point_maze
 from lerobot_pf2mp.envs.maze.swept_ball import SweptBall
 from lerobot_pf2mp.envs.tasks import MAZE_OF_TASK
+from lerobot_pf2mp.process import renaming
 
 CORRIDOR = "1111111/1000001/1111111"
 SPEC = DatasetSpec(
@@ -488,6 +489,7 @@ def test_a_dataset_survives_when_its_replacement_cannot_take_its_place(tmp_path:
             raise OSError(5, "Input/output error")
         return rename(path, target)
 
+    monkeypatch.setattr(renaming, "_rename", lambda *_: False)  # where the system cannot exchange folders at once
     monkeypatch.setattr(Path, "rename", fail_for_the_new_one)
     with pytest.raises(OSError, match="Input/output error"):
         write_dataset(tmp_path / "d", SPEC, toy_episodes(3), overwrite=True)
