@@ -489,7 +489,9 @@ def test_a_dataset_survives_when_its_replacement_cannot_take_its_place(tmp_path:
             raise OSError(5, "Input/output error")
         return rename(path, target)
 
-    monkeypatch.setattr(renaming, "_rename", lambda *_: False)  # where the system cannot exchange folders at once
+    monkeypatch.setattr(
+        renaming, "_rename", lambda *_: False
+    )  # where the system cannot exchange folders at once
     monkeypatch.setattr(Path, "rename", fail_for_the_new_one)
     with pytest.raises(OSError, match="Input/output error"):
         write_dataset(tmp_path / "d", SPEC, toy_episodes(3), overwrite=True)
