@@ -50,9 +50,9 @@ class FuzzConfig:
     seed: int = 0
     # After this time no new target begins, and none goes on [s].
     time_limit: float = 7200.0
-    # Folder for table.md and faults.csv.
+    # Folder for table.md.
     output_dir: Path = Path("results/fuzz")
-    # Folder for the inputs that end wrongly.
+    # Folder for faults.csv and the inputs that end wrongly.
     keep: Path = Path("outputs/fuzz")
     # Only targets whose names hold this text.
     only: str = ""
@@ -88,7 +88,8 @@ def main(config: FuzzConfig) -> None:
     faults = [one for outcomes in found.values() for one in outcomes if one.verdict not in VERDICTS[:3]]
     output_dir.mkdir(parents=True, exist_ok=True)
     (output_dir / "table.md").write_text(table, encoding="utf-8")
-    with (output_dir / "faults.csv").open("w", newline="", encoding="utf-8") as file:
+    keep.mkdir(parents=True, exist_ok=True)
+    with (keep / "faults.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["target", "number", "verdict", "said"])
         writer.writerows([one.target, one.number, one.verdict, one.said] for one in faults)
