@@ -103,6 +103,10 @@ def test_a_benchmark_that_goes_on_from_a_damaged_run(content: str, said: str, tm
     [
         (("--n_repeats=1000000000",), "n_repeats must be at most 10000"),
         (("--n_episodes=null",), "n_episodes must be int, got null"),
+        (
+            ("--env.episode_length=1000000000000000000000000000000",),
+            "env.episode_length must be at most 1000000",
+        ),
         (("--n_processes=null",), "n_processes must be int, got null"),
     ],
 )
