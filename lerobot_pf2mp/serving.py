@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import pickle
 import threading
 import time
 from collections.abc import Iterator
@@ -13,6 +12,7 @@ from typing import Any
 import grpc
 from draccus.utils import ParsingError
 from lerobot.async_inference import policy_server
+from lerobot.policies import make_pre_post_processors
 
 from lerobot_pf2mp.policies.processor_files import check_processors
 
@@ -42,10 +42,11 @@ class GuardedPolicyServer(policy_server.PolicyServer):
     def SendPolicyInstructions(self, request: Any, context: Any) -> Any:  # noqa: N802, D102
         self._admit(context)
         with _reported_to(context, self.logger):
-            # LeRobot's own protocol; pf2mp-policy-server --help says what that means.
-            path = getattr(pickle.loads(request.data), "pretrained_name_or_path", "")
-            check_processors(path, must_exist=True)
-            return super().SendPolicyInstructions(request, context)
+            try:
+                return super().SendPolicyInstructions(request, context)
+            except BaseException:
+                self.policy = None  # its weights may be there already, without its processors
+                raise
 
     def SendObservations(self, request_iterator: Iterator[Any], context: Any) -> Any:  # noqa: N802, D102
         self._admit(context)
@@ -83,7 +84,7 @@ def _reported_to(context: Any, logger: Any) -> Iterator[None]:
 
 
 def serve(config: Any, client_timeout: float) -> None:
-    """Starts the server and waits until it ends.
+    """Starts the server, which checks processors before it loads them, and waits until it ends.
 
     Args:
         config: LeRobot's configuration of the server.
@@ -93,5 +94,13 @@ def serve(config: Any, client_timeout: float) -> None:
     def make_server(server_config: Any) -> GuardedPolicyServer:
         return GuardedPolicyServer(server_config, client_timeout)
 
-    policy_server.PolicyServer = make_server  # `serve` makes its server by this name
+    # LeRobot's module makes its server, and loads processors, by these names.
+    policy_server.PolicyServer = make_server
+    policy_server.make_pre_post_processors = load_checked_processors
     policy_server.serve(config)
+
+
+def load_checked_processors(config: Any, pretrained_path: str, **options: Any) -> Any:
+    """LeRobot's `make_pre_post_processors` of a checkpoint, after `check_processors`."""
+    check_processors(pretrained_path, must_exist=True)
+    return make_pre_post_processors(config, pretrained_path=pretrained_path, **options)

@@ -2,7 +2,6 @@
 """The policy server serves one client, and only checked checkpoints."""
 
 import json
-import pickle
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,7 +13,7 @@ from lerobot.async_inference.configs import PolicyServerConfig
 from lerobot.async_inference.helpers import RemotePolicyConfig
 from untrained_policies import write_checkpoint
 
-from lerobot_pf2mp.serving import GuardedPolicyServer
+from lerobot_pf2mp.serving import GuardedPolicyServer, load_checked_processors
 
 
 class AbortedError(Exception):
@@ -45,13 +44,19 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 
 @pytest.fixture
-def server() -> GuardedPolicyServer:
+def server(monkeypatch: pytest.MonkeyPatch) -> GuardedPolicyServer:
+    monkeypatch.setattr(
+        policy_server, "make_pre_post_processors", load_checked_processors
+    )  # as `serve` does it
+    monkeypatch.setattr(
+        policy_server, "pickle", SimpleNamespace(loads=lambda data: data)
+    )  # these tests send none
     return GuardedPolicyServer(PolicyServerConfig(obs_queue_timeout=0.01), client_timeout=30.0)
 
 
 def instructions(kind: str, checkpoint: str) -> Any:
     specs = RemotePolicyConfig(kind, checkpoint, {}, 4, "cpu")
-    return SimpleNamespace(data=pickle.dumps(specs))
+    return SimpleNamespace(data=specs)
 
 
 def test_a_second_client_is_refused_until_the_first_is_silent(
@@ -93,16 +98,17 @@ def test_a_served_policy_is_not_replaced(
     ("kind", "said"),
     [
         ("act", "got the class 'subprocess.Popen': nothing of it was imported"),
-        ("nowhere", "must hold its processors, got nowhere without"),
+        ("incomplete", "must hold its processors, got "),
     ],
 )
 def test_the_client_is_told_what_is_wrong_with_its_checkpoint(
     kind: str, said: str, server: GuardedPolicyServer, tmp_path: Path
 ) -> None:
-    checkpoint = "nowhere"
-    if kind == "act":
-        checkpoint = write_checkpoint(tmp_path / "policy", "act")
-        path = Path(checkpoint) / "policy_postprocessor.json"
+    checkpoint = write_checkpoint(tmp_path / "policy", "act")
+    path = Path(checkpoint) / "policy_postprocessor.json"
+    if kind == "incomplete":
+        path.unlink()
+    else:
         pipeline = json.loads(path.read_text())
         pipeline["steps"].append({"class": "subprocess.Popen", "config": {"args": ["true"]}})
         path.write_text(json.dumps(pipeline))
