@@ -9,6 +9,7 @@ import random
 import shutil
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -280,21 +281,25 @@ def fuzz_expert(seeds: Path) -> Make:
     return make
 
 
+# The shares of inputs of a command's configuration file and of its command line.
+SHARES = {
+    "pf2mp-collect": (1, 1),
+    "pf2mp-collect pen": (0.5, 0.5),
+    "pf2mp-convert": (1, 1),
+    "pf2mp-benchmark": (0.5, 0.5),
+    "pf2mp-fit-field": (1, 1),
+    "pf2mp-plot": (0.5, 0.5),
+    "pf2mp-train-expert": (0.5, 0.0),
+}
+
 # Each with the share of inputs that it gets.
 TARGETS: dict[str, tuple[Callable[[Path], Make], float]] = {
-    "YAML, pf2mp-collect": (lambda seeds: fuzz_file("pf2mp-collect", seeds), 1),
-    "YAML, pf2mp-collect pen": (lambda seeds: fuzz_file("pf2mp-collect pen", seeds), 0.5),
-    "YAML, pf2mp-convert": (lambda seeds: fuzz_file("pf2mp-convert", seeds), 1),
-    "YAML, pf2mp-benchmark": (lambda seeds: fuzz_file("pf2mp-benchmark", seeds), 0.5),
-    "YAML, pf2mp-fit-field": (lambda seeds: fuzz_file("pf2mp-fit-field", seeds), 1),
-    "YAML, pf2mp-plot": (lambda seeds: fuzz_file("pf2mp-plot", seeds), 0.5),
-    "YAML, pf2mp-train-expert": (lambda seeds: fuzz_file("pf2mp-train-expert", seeds), 0.5),
-    "command line, pf2mp-collect": (lambda seeds: fuzz_line("pf2mp-collect", seeds), 1),
-    "command line, pf2mp-collect pen": (lambda seeds: fuzz_line("pf2mp-collect pen", seeds), 0.5),
-    "command line, pf2mp-convert": (lambda seeds: fuzz_line("pf2mp-convert", seeds), 1),
-    "command line, pf2mp-benchmark": (lambda seeds: fuzz_line("pf2mp-benchmark", seeds), 0.5),
-    "command line, pf2mp-fit-field": (lambda seeds: fuzz_line("pf2mp-fit-field", seeds), 1),
-    "command line, pf2mp-plot": (lambda seeds: fuzz_line("pf2mp-plot", seeds), 0.5),
+    **{f"YAML, {name}": (partial(fuzz_file, name), share) for name, (share, _) in SHARES.items()},
+    **{
+        f"command line, {name}": (partial(fuzz_line, name), share)
+        for name, (_, share) in SHARES.items()
+        if share
+    },
     "D4RL": (fuzz_source("d4rl", "d4rl.hdf5", "maze_umaze", change_by_suffix), 1.5),
     "Minari": (fuzz_source("minari", "minari", "maze_umaze", change_by_suffix), 1.5),
     "Fetch, npz": (fuzz_source("fetch", "reach.npz", "fetch_reach", change_by_suffix), 1),
