@@ -9,7 +9,8 @@ others, once with densities that leave out an action's own episode, once with th
 
 takes a minute for each dataset. RECORDINGS is a folder with recordings by others: panda_symbols/symbol_17.mat (Panda
 guided along a symbol; AutoLabModena/Panda-Co-Manipulation-Dataset), panda_arm/trajectories.csv (Panda joints;
-mesha0703/panda-arm-visualization) and omniglot/strokes_background_small1.zip (drawings by people; brendenlake/omniglot).
+mesha0703/panda-arm-visualization), handwriting_tablet/signal.svc (a pen on a tablet; BDALab/handwriting-sample) and
+omniglot/strokes_background_small1.zip (drawings by people; brendenlake/omniglot).
 """
 
 from __future__ import annotations
@@ -72,7 +73,8 @@ def all_sets(config: HeldOutConfig) -> Iterator[tuple[str, Tensor, Tensor]]:
         yield name, actions[:, :7] if name.startswith("handwriting") else actions, episodes
     if config.recordings is not None:
         yield "Panda symbol, plane", *read_symbols(config.recordings / "panda_symbols/symbol_17.mat")
-        yield "Panda joints", *read_joints(config.recordings / "panda_arm/trajectories.csv")
+        yield "Panda joints, 20 parts", *read_joints(config.recordings / "panda_arm/trajectories.csv")
+        yield "tablet, 20 parts", *read_tablet(config.recordings / "handwriting_tablet/signal.svc")
         for number in (0, 7, 30):
             path = config.recordings / "omniglot/strokes_background_small1.zip"
             yield f"drawing {number}, 20 people", *read_drawings(path, number)
@@ -95,6 +97,13 @@ def read_joints(path: Path) -> tuple[Tensor, Tensor]:
     joints = torch.tensor([[float(row[f"joint_{i}"]) for i in range(1, 8)] for row in rows])
     joints = joints[(joints != 0).any(dim=1)]
     return joints, torch.arange(len(joints)) * 20 // len(joints)
+
+
+def read_tablet(path: Path) -> tuple[Tensor, Tensor]:
+    """Positions of a pen on paper (x, y, time, status, ... after a first line), one recording, in twenty successive parts."""
+    samples = torch.from_numpy(np.loadtxt(path, skiprows=1, dtype=np.float32))
+    positions = samples[samples[:, 3] == 1, :2]
+    return positions, torch.arange(len(positions)) * 20 // len(positions)
 
 
 def read_drawings(path: Path, number: int) -> tuple[Tensor, Tensor]:
