@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from lerobot_pf2mp.loading import load_policy
     from lerobot_pf2mp.policies.dppf.configuration_dppf import DPPFConfig
     from lerobot_pf2mp.policies.fmp.configuration_fmp import FMPConfig
+    from lerobot_pf2mp.policies.guarded.configuration_guarded import GuardedConfig
     from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
     from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
 
@@ -25,6 +26,7 @@ __version__ = "0.1.0"
 __all__ = [
     "DPPFConfig",
     "FMPConfig",
+    "GuardedConfig",
     "PF2MPConfig",
     "PF2MPFetchEnv",
     "PF2MPHandwritingEnv",
@@ -36,6 +38,7 @@ __all__ = [
 _MODULES = {
     "DPPFConfig": "policies.dppf.configuration_dppf",
     "FMPConfig": "policies.fmp.configuration_fmp",
+    "GuardedConfig": "policies.guarded.configuration_guarded",
     "PF2MPConfig": "policies.pf2mp.configuration_pf2mp",
     "PF2MPFetchEnv": "envs.configs.fetch",
     "PF2MPHandwritingEnv": "envs.configs.handwriting",

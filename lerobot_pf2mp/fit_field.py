@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gives a trained policy a potential field without retraining: diffusion becomes dppf, fmp becomes pf2mp."""
+"""Gives a trained policy a potential field without retraining: diffusion becomes dppf, fmp pf2mp, any other guarded."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ from lerobot_pf2mp.errors import explained
 from lerobot_pf2mp.field_report.of_dataset import report_on_dataset
 from lerobot_pf2mp.field_report.report import FieldReport
 from lerobot_pf2mp.loading import load_config
+from lerobot_pf2mp.policies.guarded.configuration_guarded import GuardedConfig
 from lerobot_pf2mp.policies.guided.action_kind import warn_unless_positions
 from lerobot_pf2mp.policies.guided.action_units import normalised_unit, normaliser_of, places_of_states
 from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
@@ -38,7 +39,8 @@ from lerobot_pf2mp.policies.plans.demonstrated_plans import choose_plans_of_epis
 from lerobot_pf2mp.policies.processor_files import check_processors
 from lerobot_pf2mp.process.atomic_files import written_beside
 
-GUIDED_TYPES = {"fmp": "pf2mp", "pf2mp": "pf2mp", "diffusion": "dppf", "dppf": "dppf"}
+# Policies with a guided form of their own. All others become guarded ones.
+GUIDED_TYPES = {"fmp": "pf2mp", "pf2mp": "pf2mp", "diffusion": "dppf", "dppf": "dppf", "guarded": "guarded"}
 
 _FRAMES_AT_ONCE = 65536
 
@@ -62,7 +64,8 @@ def fit_field(
     generates. The anchors are those that training on all frames would have kept.
 
     Args:
-        checkpoint: A ``pretrained_model`` folder or a repository on the Hub, of a type in `GUIDED_TYPES`.
+        checkpoint: A ``pretrained_model`` folder or a repository on the Hub. A policy of a type in `GUIDED_TYPES` gets the
+            type that stands there, any other one is guarded.
         output_dir: The folder to write.
         repo_id: Name of the LeRobotDataset.
         root: Its folder; None for LeRobot's cache, filled from the Hub.
@@ -207,7 +210,7 @@ def _load_dataset(
 
 def _guided_config(config: PreTrainedConfig, options: dict[str, Any]) -> PreTrainedConfig:
     if config.type not in GUIDED_TYPES:
-        raise ValueError(f"the checkpoint's type must be one of {list(GUIDED_TYPES)}, got {config.type!r}")
+        return GuardedConfig(base=config, **options)
     guided_class = PreTrainedConfig.get_choice_class(GUIDED_TYPES[config.type])
     values = {field.name: getattr(config, field.name) for field in fields(config) if field.init}
     return guided_class(**{**values, **options})
@@ -260,7 +263,7 @@ def _observe_plans(
         torch.from_numpy(np.array(numbers[key])).reshape(-1) for key in ("index", "episode_index")
     )
     n_actions = len(delta) + int(delta[0])  # from the current step on
-    n_dropped = min(cast(Any, config).drop_n_last_frames, n_actions - 1)
+    n_dropped = min(getattr(config, "drop_n_last_frames", 0), n_actions - 1)
     n_dropped = max(n_dropped, cast(Any, config).n_action_steps - 1)  # as `DemonstratedActions.observe`
     chosen = choose_plans_of_episodes(episodes, frames, n_dropped)
     if not len(chosen):

@@ -40,6 +40,7 @@ def register_with_lerobot() -> None:
     import lerobot_pf2mp.envs.configs.maze
     import lerobot_pf2mp.policies.dppf.configuration_dppf
     import lerobot_pf2mp.policies.fmp.configuration_fmp
+    import lerobot_pf2mp.policies.guarded.configuration_guarded
     import lerobot_pf2mp.policies.guided.potential_field_step
     import lerobot_pf2mp.policies.pf2mp.configuration_pf2mp  # noqa: F401
 

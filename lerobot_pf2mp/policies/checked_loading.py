@@ -3,10 +3,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, Self
 
-from lerobot.policies.pretrained import load_model_as_safetensor, resolve_safetensors_device
+from huggingface_hub import hf_hub_download
+from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
+from lerobot.policies.pretrained import (
+    PreTrainedPolicy,
+    load_model_as_safetensor,
+    resolve_safetensors_device,
+)
+from safetensors import safe_open
 
 from lerobot_pf2mp.errors import ConfigError
 from lerobot_pf2mp.policies.processor_files import check_processors
@@ -40,13 +48,46 @@ class CheckedLoading:
         missing, _ = load_model_as_safetensor(
             model, model_file, strict=strict, device=resolve_safetensors_device(map_location)
         )
-        if missing:
-            shown = ", ".join(sorted(missing)[:3])
-            raise ValueError(
-                f"{model_file} must hold all weights of a {cls.name} policy of this configuration, got a file without "
-                f"{len(missing)} of them ({shown}{', ...' if len(missing) > 3 else ''})"
-            )
+        _refuse_missing(missing, model_file, cls.name)
         return model
+
+
+def require_all_weights(policy: PreTrainedPolicy, path: str | Path, revision: str | None = None) -> None:
+    """Checks that a policy that is not ours got all its weights. LeRobot only logs those that are missing.
+
+    Policies that load their weights in their own way are not checked, because the names in their files may differ.
+
+    Args:
+        policy: The policy.
+        path: The checkpoint from which it was loaded, a folder or a repository on the Hub.
+        revision: Branch, tag or commit on the Hub.
+
+    Raises:
+        ValueError: If weights are missing.
+    """
+    for name in ("from_pretrained", "_load_as_safetensor"):
+        if getattr(type(policy), name).__func__ is not getattr(PreTrainedPolicy, name).__func__:
+            return
+    file = Path(path, SAFETENSORS_SINGLE_FILE)
+    if not Path(path).is_dir():
+        file = Path(hf_hub_download(str(path), SAFETENSORS_SINGLE_FILE, revision=revision))
+    with safe_open(file, framework="pt") as weights:
+        found = set(weights.keys())
+    state = policy.state_dict()
+    there = {
+        state[key].data_ptr() for key in found & set(state)
+    }  # of tensors that share memory, one is in the file
+    missing = [key for key, value in state.items() if key not in found and value.data_ptr() not in there]
+    _refuse_missing(missing, str(file), str(policy.name))
+
+
+def _refuse_missing(missing: Collection[str], file: str, name: str) -> None:
+    if missing:
+        shown = ", ".join(sorted(missing)[:3])
+        raise ValueError(
+            f"{file} must hold all weights of a {name} policy of this configuration, got a file without "
+            f"{len(missing)} of them ({shown}{', ...' if len(missing) > 3 else ''})"
+        )
 
 
 def require_own_config(policy: Any, config: Any) -> None:

@@ -7,7 +7,8 @@ field is fitted again, with the rule of before and with that of now, and the pol
 
     python tests/benchmarks/glitches.py --checkpoint=CHECKPOINT --output_dir=results/ablations/glitches
 
-takes a quarter of an hour for the 15 fields of the large maze with 500 episodes each.
+takes a quarter of an hour for the 14 fields of the large maze with 500 episodes each, once with a single plan and once with
+plans that are checked and drawn again.
 """
 
 from __future__ import annotations
@@ -61,7 +62,10 @@ def main(config: GlitchesConfig) -> None:
         tasks=(config.task,),
         policies=policies,
         guidances=tuple(Guidance.parse("proximal:0.8")),
-        variants={"": {"max_plans": 1, "guidance_region": "everywhere"}},  # what the field alone does
+        variants={  # what the field alone does, and with plans checked by that field
+            "one plan": {"max_plans": 1, "guidance_region": "everywhere"},
+            "checked plans": {},
+        },
         seeds=(0,),
         n_repeats=1,
         n_episodes=config.n_episodes,

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -16,6 +14,7 @@ from lerobot_pf2mp.flow_matching import Guide
 from lerobot_pf2mp.policies.checked_loading import require_own_config
 from lerobot_pf2mp.policies.dppf.configuration_dppf import DPPFConfig
 from lerobot_pf2mp.policies.guided.field_guidance import FieldGuidance
+from lerobot_pf2mp.policies.guided.guided_scheduler import guided_scheduler
 from lerobot_pf2mp.policies.image_sizes import check_image_sizes
 from lerobot_pf2mp.policies.own_policy import OwnPolicy
 from lerobot_pf2mp.policies.plans.plans import Plans
@@ -78,12 +77,12 @@ class DPPFPolicy(OwnPolicy, DiffusionPolicy):
         self.guidance.begin()
         guide = guide or self.guidance.guide(batch, next(self.parameters()).device)
         window = self._with_window(batch)
-        with self._guided(guide):
+        with guided_scheduler(self.diffusion, guide):
             chunk = super().predict_action_chunk(window, noise=noise)
 
         def draw_more(rows: Tensor, n: int) -> Tensor:
             observations = self._observations_of(window, rows, n)
-            with self._guided(guide):
+            with guided_scheduler(self.diffusion, guide):
                 return self.diffusion.generate_actions(observations)
 
         return self.guidance.choose(batch, chunk, draw_more)
@@ -127,33 +126,3 @@ class DPPFPolicy(OwnPolicy, DiffusionPolicy):
                 frame = batch[key].unsqueeze(1)
                 window[key] = frame.expand(-1, self.config.n_obs_steps, *frame.shape[2:])
         return window
-
-    @contextmanager
-    def _guided(self, guide: Guide | None) -> Iterator[None]:
-        scheduler = self.diffusion.noise_scheduler
-        if guide is not None:
-            self.diffusion.noise_scheduler = _GuidedScheduler(scheduler, guide)
-        try:
-            yield
-        finally:
-            self.diffusion.noise_scheduler = scheduler
-
-
-class _GuidedScheduler:
-    """A noise scheduler of diffusers with a guide in every step.
-
-    For the guidance, each of the N denoising steps has the length dt = 1/N, as in the flow.
-    """
-
-    def __init__(self, scheduler: Any, guide: Guide) -> None:
-        self._scheduler = scheduler
-        self._guide = guide
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._scheduler, name)
-
-    def step(self, model_output: Tensor, timestep: int, sample: Tensor, **kwargs: Any) -> Any:
-        output = self._scheduler.step(model_output, timestep, sample, **kwargs)
-        dt = 1 / len(self._scheduler.timesteps)
-        output.prev_sample = self._guide(sample, output.prev_sample, output.pred_original_sample, dt)
-        return output

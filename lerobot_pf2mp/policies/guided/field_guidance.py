@@ -32,9 +32,10 @@ from lerobot_pf2mp.training.run_dataset import find_dataset, run_episodes
 
 if TYPE_CHECKING:
     from lerobot_pf2mp.policies.dppf.configuration_dppf import DPPFConfig
+    from lerobot_pf2mp.policies.guarded.configuration_guarded import GuardedConfig
     from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
 
-    type GuidedPolicyConfig = PF2MPConfig | DPPFConfig
+    type GuidedPolicyConfig = PF2MPConfig | DPPFConfig | GuardedConfig
 
 
 logger = logging.getLogger(__name__)
@@ -122,7 +123,7 @@ class FieldGuidance:
             dataset_id=self._dataset_id,
             n_past=-first,
             n_executed=self.config.n_action_steps,
-            drop_n_last_frames=self.config.drop_n_last_frames,
+            drop_n_last_frames=getattr(self.config, "drop_n_last_frames", 0),
             states=states,
             places=self._places,
         )
@@ -174,14 +175,14 @@ class FieldGuidance:
         self,
         batch: dict[str, Any],
         chunk: Tensor,
-        draw_more: DrawMore,
+        draw_more: DrawMore | None,
     ) -> Tensor:
         """The chunks ``(B, T, A)`` to execute: checked, drawn again if need be, see ``max_plans`` in `GuidedConfig`.
 
         Args:
             batch: A batch that the policy's own preprocessor has made.
             chunk: ``(B, T, A)`` planned actions [normalised].
-            draw_more: Draws further plans.
+            draw_more: Draws further plans; None if there is no other plan.
 
         Raises:
             ValueError: If an action is not finite; if the field, or its calibration for plans, is missing although plans
@@ -200,7 +201,7 @@ class FieldGuidance:
         self,
         batch: dict[str, Any],
         chunk: Tensor,
-        draw_more: DrawMore,
+        draw_more: DrawMore | None,
         is_checked: bool,
     ) -> Tensor:
         require_finite(chunk, batch)
