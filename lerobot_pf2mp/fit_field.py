@@ -16,9 +16,8 @@ from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.lerobot_types import TransitionKey
-from lerobot.policies import make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
-from lerobot.processor import DeviceProcessorStep, NormalizerProcessorStep, PolicyProcessorPipeline
+from lerobot.processor import NormalizerProcessorStep
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 from tqdm import tqdm
@@ -26,7 +25,7 @@ from tqdm import tqdm
 from lerobot_pf2mp.errors import explained
 from lerobot_pf2mp.field_report.of_dataset import report_on_dataset
 from lerobot_pf2mp.field_report.report import FieldReport
-from lerobot_pf2mp.loading import load_config
+from lerobot_pf2mp.loading import load_config, load_processors, save_processors
 from lerobot_pf2mp.policies.guarded.configuration_guarded import GuardedConfig
 from lerobot_pf2mp.policies.guided.action_kind import warn_unless_positions
 from lerobot_pf2mp.policies.guided.action_units import normalised_unit, normaliser_of, places_of_states
@@ -36,7 +35,6 @@ from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldPro
 from lerobot_pf2mp.policies.guided.relative_actions import refuse_relative_actions
 from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
 from lerobot_pf2mp.policies.plans.demonstrated_plans import choose_plans_of_episodes
-from lerobot_pf2mp.policies.processor_files import check_processors
 from lerobot_pf2mp.process.atomic_files import written_beside
 
 # Policies with a guided form of their own. All others become guarded ones.
@@ -95,7 +93,7 @@ def fit_field(
         with explained(f"the checkpoint {checkpoint} cannot be loaded"):
             policy_class = get_policy_class(guided.type)
             policy = policy_class.from_pretrained(checkpoint, config=guided, revision=checkpoint_revision)
-            preprocessor, postprocessor = _load_processors(config, str(checkpoint), checkpoint_revision)
+            preprocessor, postprocessor = load_processors(config, checkpoint, checkpoint_revision)
         refuse_relative_actions(preprocessor.steps)
         dataset = _load_dataset(repo_id, root, episodes, dataset_revision)
         warn_unless_positions(dataset, guided.field_settings.action_dims)
@@ -106,14 +104,10 @@ def fit_field(
             *(old for old in preprocessor.steps if not isinstance(old, PotentialFieldProcessorStep)),
             step,
         ]
-        # Only the fitting is done on the CPU.
-        guided.device = device
-        for old in preprocessor.steps:
-            if isinstance(old, DeviceProcessorStep):
-                old.device = str(device)
+        guided.device = device  # only the fitting is done on the CPU
         with explained(f"the checkpoint {output_dir} cannot be written"):
-            for part in (policy, preprocessor, postprocessor):
-                part.save_pretrained(new)
+            policy.save_pretrained(new)
+            save_processors((preprocessor, postprocessor), new, str(device))
     return guided
 
 
@@ -152,7 +146,7 @@ def examine_dataset(
         loaded = load_config(checkpoint, revision=checkpoint_revision, device="cpu")
         config = _guided_config(loaded, options or {})
         with explained(f"the checkpoint {checkpoint} cannot be loaded"):
-            preprocessor, _ = _load_processors(loaded, str(checkpoint), checkpoint_revision)
+            preprocessor, _ = load_processors(loaded, checkpoint, checkpoint_revision)
         steps = list(preprocessor.steps)
         refuse_relative_actions(steps)
         dataset = _load_dataset(repo_id, root, episodes, dataset_revision)
@@ -170,18 +164,6 @@ def _normaliser_for(config: PreTrainedConfig, dataset: LeRobotDataset) -> Normal
         )
     config.output_features = {ACTION: PolicyFeature(FeatureType.ACTION, shape)}
     return normaliser_of(config, cast(dict[str, Any], dataset.meta.stats))
-
-
-def _load_processors(
-    config: PreTrainedConfig, checkpoint: str, revision: str | None
-) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
-    check_processors(checkpoint, revision, must_exist=True)
-    return make_pre_post_processors(
-        config,
-        pretrained_path=checkpoint,
-        pretrained_revision=revision,
-        preprocessor_overrides={"device_processor": {"device": "cpu"}},
-    )
 
 
 def _load_dataset(

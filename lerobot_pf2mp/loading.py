@@ -6,13 +6,15 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import fields
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy, make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
-from lerobot.processor import PolicyAction, PolicyProcessorPipeline
+from lerobot.processor import DeviceProcessorStep, PolicyAction, PolicyProcessorPipeline
+from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_pf2mp.errors import explained
 from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
@@ -116,10 +118,42 @@ def loaded_demonstrations(
     )
 
 
+def load_processors(
+    config: PreTrainedConfig, path: str | Path, revision: str | None = None
+) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
+    """A checkpoint's preprocessor and postprocessor, on the CPU.
+
+    Args:
+        config: The checkpoint's configuration.
+        path: A ``pretrained_model`` folder or a repository on the Hub.
+        revision: Branch, tag or commit on the Hub.
+
+    Raises:
+        ValueError: If they are missing, damaged, or would run foreign code.
+    """
+    check_processors(str(path), revision, must_exist=True)
+    return make_pre_post_processors(
+        config,
+        pretrained_path=str(path),
+        pretrained_revision=revision,
+        preprocessor_overrides={"device_processor": {"device": "cpu"}},
+    )
+
+
+def save_processors(processors: Sequence[PolicyProcessorPipeline], folder: Path, device: str) -> None:
+    """Saves a policy's processors, which will move observations to a device."""
+    for step in processors[0].steps:
+        if isinstance(step, DeviceProcessorStep):
+            step.device = device
+    for processor in processors:
+        processor.save_pretrained(folder)
+
+
 def load_config(
     path: str | Path, *, revision: str | None = None, device: str | None = None, **overrides: Any
 ) -> PreTrainedConfig:
     """Loads a checkpoint's configuration. The arguments and errors are those of `load_policy`."""
+    _register_plugins()
     path = Path(path).expanduser()
     is_repository_name = len(path.parts) == 2 and not path.is_absolute()
     if not path.is_dir() and not is_repository_name:
@@ -144,3 +178,9 @@ def load_config(
     # LeRobot leaves this empty. It would then create new processors, without statistics and without the field.
     config.pretrained_path = path
     return config
+
+
+@cache
+def _register_plugins() -> None:
+    """Makes the policies of other installed plug-ins known, as LeRobot's own commands do."""
+    register_third_party_plugins()

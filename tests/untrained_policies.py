@@ -12,7 +12,7 @@ from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 from lerobot.policies.factory import get_policy_class
 
-from lerobot_pf2mp import DPPFConfig, FMPConfig, PF2MPConfig
+from lerobot_pf2mp import DPPFConfig, FMPConfig, GuardedConfig, PF2MPConfig
 from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
 
 STATE, ENV, ACTION = "observation.state", "observation.environment_state", "action"
@@ -50,6 +50,7 @@ MAKE_CONFIG: dict[str, Callable[[], PreTrainedConfig]] = {
     "diffusion": lambda: DiffusionConfig(**DENOISING),
     "dppf": lambda: DPPFConfig(**DENOISING),
     "act": lambda: ACTConfig(**TRANSFORMER),
+    "guarded": lambda: GuardedConfig(base=ACTConfig(**TRANSFORMER)),
 }
 
 

@@ -69,9 +69,11 @@ class FitFieldDatasetConfig:
 
 @dataclass
 class FitFieldConfig:
-    """Gives a trained policy a potential field without retraining: diffusion becomes dppf, fmp becomes pf2mp.
+    """Gives a trained policy a potential field without retraining: fmp becomes pf2mp, diffusion dppf, all others guarded.
 
-    A pf2mp or dppf policy gets a new field. The new checkpoint works with lerobot-eval, lerobot-train and lerobot-rollout.
+    Any policy of LeRobot, or of a plug-in, that plans chunks of absolute actions is guarded: act, smolvla, pi0, pi05, vqbet,
+    multi_task_dit, ... A pf2mp, dppf or guarded policy gets a new field. The new checkpoint works with lerobot-eval,
+    lerobot-train and lerobot-rollout. Its weights are those of the policy; --unguard=true gives the policy back.
 
     --report=FOLDER writes a page about the field: whether there are enough demonstrations, which of them are alone, wrong
     values. It needs a dataset only; without --output_dir no checkpoint is written.
@@ -81,6 +83,8 @@ class FitFieldConfig:
 --dataset.repo_id=you/your_dataset --output_dir=outputs/dppf
         pf2mp-fit-field --policy.path=you/your_fmp --policy.n_field_points=10000 --dataset.repo_id=you/your_dataset \
 --output_dir=outputs/pf2mp
+        pf2mp-fit-field --policy.path=you/your_act --dataset.repo_id=you/your_dataset --output_dir=outputs/guarded_act
+        pf2mp-fit-field --policy.path=outputs/guarded_act --unguard=true --output_dir=outputs/act
         pf2mp-fit-field --dataset.repo_id=you/your_dataset --report=reports/your_dataset
     """
 
@@ -92,6 +96,8 @@ class FitFieldConfig:
     output_dir: Path | None = None
     # Folder of a new report: report.html, report.json and figures.
     report: Path | None = None
+    # Whether to write the policy without its field instead, as it was before: pf2mp becomes fmp, dppf diffusion, and so on.
+    unguard: bool = False
     # Classes of processor steps of a checkpoint that may be imported although they are not registered, by full names.
     trust: list[str] = field(default_factory=list)
     # Whether to replace an existing checkpoint and report.
@@ -102,6 +108,9 @@ def main(config: FitFieldConfig) -> None:
     """Runs the command."""
     policy, dataset = config.policy, config.dataset
     path = policy.path
+    if config.unguard:
+        _write_unguarded(given("--policy.path", path), given("--output_dir", config.output_dir), config)
+        return
     if config.report is None or config.output_dir is not None:
         path = given("--policy.path", path)
     options = {name: value for name, value in asdict(policy).items() if value is not None}
@@ -129,6 +138,31 @@ def main(config: FitFieldConfig) -> None:
         _write_checkpoint(given("--output_dir", config.output_dir), chosen, config.overwrite)
     else:
         _write_report(config.report.expanduser(), config.output_dir, chosen, config.overwrite)
+
+
+def _write_unguarded(path: str, output_dir: Path, config: FitFieldConfig) -> None:
+    """Writes the policy of a guided checkpoint without its field."""
+    ignored = [
+        name
+        for name, part in (("--policy", config.policy), ("--dataset", config.dataset))
+        for key, value in asdict(part).items()
+        if value is not None and key not in ("path", "revision")
+    ]
+    if ignored or config.report is not None:
+        raise ValueError(
+            "--unguard=true takes --policy.path, --policy.revision and --output_dir alone, got "
+            f"{', '.join(sorted({f'{name}.*' for name in ignored}) or ['--report'])} too"
+        )
+    from lerobot_pf2mp.unguarding import unguard
+
+    folder = Path(path).expanduser()
+    plain = unguard(
+        folder if folder.is_dir() else path,
+        output_dir.expanduser(),
+        revision=config.policy.revision,
+        overwrite=config.overwrite,
+    )
+    print(f"Wrote a checkpoint of type {plain.type} to {output_dir}.")
 
 
 def _write_checkpoint(output_dir: Path, chosen: dict[str, Any], overwrite: bool, **options: Any) -> None:
