@@ -15,6 +15,7 @@ import pandas as pd
 import PIL.Image
 import pytest
 import torch
+from draccus.utils import ParsingError
 from forked_commands import run_well
 from hub_server import HubServer
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
@@ -22,8 +23,8 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.policies import make_pre_post_processors
-from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.factory import get_policy_class, make_policy
+from lerobot.policies.gaussian_actor.configuration_gaussian_actor import GaussianActorConfig
 from lerobot.processor import DataProcessorPipeline
 from safetensors.torch import load_file
 from torch import Tensor
@@ -279,7 +280,13 @@ def arguments(checkpoint: Path, data: Path, output: Path) -> list[str]:
 
 
 def test_diffusion_policies_become_dppf_and_flow_matching_policies_pf2mp():
-    assert GUIDED_TYPES == {"diffusion": "dppf", "dppf": "dppf", "fmp": "pf2mp", "pf2mp": "pf2mp"}
+    assert GUIDED_TYPES == {
+        "diffusion": "dppf",
+        "dppf": "dppf",
+        "fmp": "pf2mp",
+        "pf2mp": "pf2mp",
+        "guarded": "guarded",
+    }
 
 
 @pytest.mark.slow
@@ -540,11 +547,10 @@ def damaged(checkpoint: Path, copy: Path, damage: Callable[[Path], Any]) -> Path
     return copy
 
 
-def test_a_policy_of_another_type_is_refused_with_the_choices(shown, tmp_path):
-    ACTConfig(device="cpu").save_pretrained(tmp_path / "act")
-    choices = r"\['fmp', 'pf2mp', 'diffusion', 'dppf'\]"
-    with pytest.raises(ValueError, match=f"the checkpoint's type must be one of {choices}, got 'act'"):
-        fit(tmp_path / "act", tmp_path / "new", shown)
+def test_a_policy_that_plans_no_chunks_is_refused(shown, tmp_path):
+    GaussianActorConfig(device="cpu").save_pretrained(tmp_path / "actor")
+    with pytest.raises(ParsingError, match="must plan chunks of actions, got gaussian_actor"):
+        fit(tmp_path / "actor", tmp_path / "new", shown)
     assert not (tmp_path / "new").exists()
 
 
@@ -797,8 +803,8 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
         "old cannot be loaded: ",
     ),
     "another_policy": (
-        lambda path: ACTConfig(device="cpu").save_pretrained(path),
-        "the checkpoint's type must be one of",
+        lambda path: GaussianActorConfig(device="cpu").save_pretrained(path),
+        "must plan chunks of actions, got gaussian_actor",
     ),
 }
 

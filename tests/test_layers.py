@@ -12,7 +12,7 @@ import lerobot_pf2mp.dataset_tools
 FLOORS = (
     ("commands",),
     ("figures",),
-    ("benchmark", "fit_field", "serving"),
+    ("benchmark", "fit_field", "serving", "unguarding"),
     ("loading", "field_report"),
     ("policies",),
     ("dataset_tools", "hub"),

@@ -15,7 +15,7 @@ from . import probes
 from .line import OPTIONAL, PROBLEM, Line
 from .probes import DISTRIBUTION
 
-POLICIES = {"dppf", "fmp", "pf2mp"}
+POLICIES = {"dppf", "fmp", "guarded", "pf2mp"}
 
 _BACKENDS = {"egl": "EGL", "osmesa": "OSMesa", "glfw": "screen"}
 

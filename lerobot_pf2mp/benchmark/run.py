@@ -33,6 +33,7 @@ from lerobot_pf2mp.results.tables import make_latex, make_markdown
 
 # Names of guided policies when guidance is off.
 UNGUIDED_NAMES = {"pf2mp": "fmp", "dppf": "dp"}
+GUARDED = "guarded "
 
 
 def run_benchmark(spec: BenchmarkSpec, output_dir: Path, *, n_processes: int = 1) -> list[SummaryRow]:
@@ -103,9 +104,7 @@ def _make_jobs(spec: BenchmarkSpec) -> list[Job]:
                 jobs += [
                     Job(
                         task=task,
-                        policy=name
-                        if guidance.scale or not is_guided
-                        else UNGUIDED_NAMES.get(name, f"{name} unguided"),
+                        policy=name if guidance.scale or not is_guided else unguided_name(name),
                         checkpoint=checkpoint,
                         guidance=guidance,
                         variant=variant,
@@ -123,6 +122,13 @@ def _make_jobs(spec: BenchmarkSpec) -> list[Job]:
                 f"every policy must have its own name, got {job.policy!r} twice (guidance {job.guidance.integrator})"
             )
     return jobs
+
+
+def unguided_name(name: str) -> str:
+    """The name of a policy, which has another one with guidance, without it."""
+    if name.startswith(GUARDED):
+        return name.removeprefix(GUARDED)
+    return UNGUIDED_NAMES.get(name, f"{name} unguided")
 
 
 def _identify(row: Job | EpisodeRow) -> tuple[object, ...]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass, field
 
-POLICIES = ("fmp", "pf2mp", "dppf")
+POLICIES = ("fmp", "pf2mp", "dppf", "guarded")
 
 
 @dataclass

@@ -11,6 +11,7 @@ POLICY_NAMES = {
     "fmp": "Flow Matching Policy (FMP)",
     "pf2mp": "Potential Field-Guided Flow Matching Policy (PF2MP)",
     "dppf": "Diffusion Policy with Potential Field Guidance (DPPF)",
+    "guarded": "policy, guarded by a potential field",
 }
 
 
@@ -74,7 +75,8 @@ class PolicyFacts:
         outputs: Shapes of the output features by name.
         horizon: Actions predicted at once.
         n_action_steps: Number of these actions that are executed.
-        num_inference_steps: Integration or denoising steps N.
+        num_inference_steps: Integration or denoising steps N; None for a policy without steps.
+        base: The type of the policy that a guarded one guards; None for others.
         guidance: Its guidance; None for an unguided policy.
         license: Name of the licence; None for the default.
         tags: More tags.
@@ -85,8 +87,9 @@ class PolicyFacts:
     outputs: Mapping[str, Sequence[int]]
     horizon: int
     n_action_steps: int
-    num_inference_steps: int
+    num_inference_steps: int | None
     guidance: GuidanceFacts | None = None
+    base: str | None = None
     license: str | None = None
     tags: Sequence[str] = ()
 

@@ -18,11 +18,12 @@ from lerobot_pf2mp.hub.card_facts import POLICY_NAMES, CardFacts, GuidanceFacts
 INSTALL = "pip install lerobot_policy_pf2mp"
 DEFAULT_LICENSE = "apache-2.0"
 
-_TAGS = {"fmp": ["flow-matching"], "pf2mp": ["flow-matching"], "dppf": ["diffusion"]}
+_TAGS = {"fmp": ["flow-matching"], "pf2mp": ["flow-matching"], "dppf": ["diffusion"], "guarded": []}
 _GENERATES = {
     "fmp": "It turns noise into a chunk of actions by integrating a learned velocity field.",
     "pf2mp": "It turns noise into a chunk of actions by integrating a learned velocity field.",
     "dppf": "It is LeRobot's Diffusion Policy, whose denoising turns noise into a chunk of actions.",
+    "guarded": "Its weights are those of the policy that it guards, which generates the chunks of actions.",
 }
 _GUIDED = (
     "While it does so, a potential field, fitted to the demonstrated actions alone, steers every action back to where the "
@@ -50,7 +51,8 @@ def make_model_card(facts: CardFacts) -> ModelCard:
     kind, license = facts.policy.type, facts.policy.license or DEFAULT_LICENSE
     guidance = facts.policy.guidance
     is_guided = guidance is not None
-    tags = ["lerobot", "pf2mp", *_TAGS[kind], "robotics", kind, *facts.policy.tags]
+    base = [facts.policy.base] if facts.policy.base else []
+    tags = ["lerobot", "pf2mp", *_TAGS[kind], "robotics", kind, *base, *facts.policy.tags]
     metadata = ModelCardData(
         library_name="lerobot",
         pipeline_tag="robotics",
@@ -60,7 +62,8 @@ def make_model_card(facts: CardFacts) -> ModelCard:
     )
     sections = [
         f"# {facts.repo_id}",
-        f"A {POLICY_NAMES[kind]} for [LeRobot](https://github.com/huggingface/lerobot). {_GENERATES[kind]}"
+        f"A {' '.join([*base, POLICY_NAMES[kind]])} for [LeRobot](https://github.com/huggingface/lerobot). "
+        + _GENERATES[kind]
         + ("" if guidance is None else f" {_introduce(guidance)}"),
         "## Use",
         _usage(facts),
@@ -112,7 +115,8 @@ def _introduce(guidance: GuidanceFacts) -> str:
 def _usage(facts: CardFacts) -> str:
     dataset = facts.dataset if _is_on_the_hub(facts.dataset) else "you/your_dataset"
     env = " ".join(facts.env_options or ("--env.type=ENVIRONMENT", "--env.task=TASK"))
-    kind = facts.policy.type
+    kind, base = facts.policy.type, facts.policy.base
+    new = f"--policy.type={kind}" + (f" --policy.base.type={base}" if base else "")
     commands = f"""\
 ```bash
 {INSTALL}
@@ -122,7 +126,7 @@ lerobot-eval --policy.path={facts.repo_id} {env} \\
     --eval.n_episodes=50 --eval.batch_size=10
 
 # train a new one like it, or continue the training of this one
-lerobot-train --policy.type={kind} --dataset.repo_id={dataset} --policy.repo_id=you/your_{kind}
+lerobot-train {new} --dataset.repo_id={dataset} --policy.repo_id=you/your_{kind}
 lerobot-train --policy.path={facts.repo_id} --dataset.repo_id={dataset} --policy.repo_id=you/your_{kind}
 ```
 
@@ -153,7 +157,10 @@ def _details(facts: CardFacts) -> list[tuple[str, str]]:
         if features:
             rows.append((name, ", ".join(f"`{key}` {tuple(shape)}" for key, shape in features.items())))
     rows.append(("chunk", f"{policy.horizon} actions, of which {policy.n_action_steps} are executed"))
-    rows.append(("steps N", str(policy.num_inference_steps)))
+    if policy.base is not None:
+        rows.append(("guarded policy", policy.base))
+    if policy.num_inference_steps is not None:
+        rows.append(("steps N", str(policy.num_inference_steps)))
     if policy.guidance is not None:
         rows += _describe_guidance(policy.guidance)
     words = {"steps": "steps: {}", "batch_size": "batch size: {}", "seed": "seed: {}"}

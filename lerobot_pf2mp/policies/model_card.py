@@ -74,15 +74,24 @@ def policy_facts(
         type=config.type,
         inputs=inputs,
         outputs=outputs,
-        horizon=config.horizon,
+        horizon=len(config.action_delta_indices),
         n_action_steps=config.n_action_steps,
-        num_inference_steps=config.num_inference_steps or config.num_train_timesteps,
+        num_inference_steps=_n_steps(config),
         guidance=_guidance_facts(config, demonstrations, outputs["action"][0])
         if isinstance(config, GuidedConfig)
         else None,
+        base=config.base.type if hasattr(config, "base") else None,
         license=license or config.license,
         tags=tuple(tags or config.tags or ()),
     )
+
+
+def _n_steps(config: Any) -> int | None:
+    """The integration or denoising steps of a policy; None if it has none."""
+    for name in ("num_inference_steps", "num_integration_steps", "num_steps", "num_train_timesteps"):
+        if getattr(config, name, None) is not None:
+            return getattr(config, name)
+    return None
 
 
 def _guidance_facts(
