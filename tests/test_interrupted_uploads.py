@@ -1,39 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """A network that goes away while a checkpoint or a dataset is published: one line, nothing half-published, and again."""
 
-import json
 import re
-import subprocess
-import sys
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from command_worker import CommandWorker
 from hub_server import HubServer, Interruption
 from untrained_policies import write_checkpoint
 
-# Runs one command after the other, because each process has much to import. The real client repeats what failed, here
-# without the half minute that it waits in between.
-COMMANDS = """
-import json, sys, time
-from lerobot_pf2mp.commands import cli
-
-sleep = time.sleep
-time.sleep = lambda seconds: sleep(min(seconds, 0.02))
-for line in sys.stdin:
-    name, *arguments = json.loads(line)
-    sys.argv = [f"pf2mp-{name}", *arguments]
-    code = 0
-    try:
-        getattr(cli, name)()
-    except SystemExit as stop:
-        code = stop.code
-    print(f"=== {code}", flush=True)
-"""
-SECONDS = 120  # for a command, on a machine that is busy with other things
 LARGE_FILE, COMMIT, TAG = "PUT /storage/", "/commit/main", "/tag/v3.0"
-Run = Callable[[list[str]], tuple[int, str]]
+Run = Callable[..., tuple[int, str]]
 
 
 @pytest.fixture(scope="module")
@@ -47,44 +25,20 @@ def hub() -> Iterator[HubServer]:
 def run(hub: HubServer, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
     """A function that runs a command and returns its exit code and what it wrote to the standard error stream."""
     home = tmp_path_factory.mktemp("home")
-    with (home / "stderr").open("w") as stderr:
-        process = subprocess.Popen(
-            [sys.executable, "-c", COMMANDS],
-            env={**hub.environment(home, "writes"), "HF_HUB_DOWNLOAD_TIMEOUT": "1"},
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=stderr,
-            text=True,
-        )
-    assert process.stdin is not None and process.stdout is not None
-    stdin, stdout = process.stdin, process.stdout
-
-    def run(command: list[str]) -> tuple[int, str]:
-        n_before = len((home / "stderr").read_text())
-        stdin.write(json.dumps(command) + "\n")
-        stdin.flush()
-        timer = threading.Timer(SECONDS, process.kill)
-        timer.start()
-        code = next((int(line[4:]) for line in stdout if line.startswith("=== ")), None)
-        timer.cancel()
-        assert code is not None, f"it still ran after {SECONDS} s"
-        return code, (home / "stderr").read_text()[n_before:]
-
-    with process:
-        yield run
-        stdin.close()
+    with CommandWorker({**hub.environment(home, "writes"), "HF_HUB_DOWNLOAD_TIMEOUT": "1"}) as worker:
+        yield worker.run
 
 
 def push(folder: Path) -> list[str]:
     path = folder / "policy"
     if not path.exists():
         write_checkpoint(path, "pf2mp")
-    return ["push", f"--path={path}", f"--repo_id=user/{folder.name}"]
+    return ["pf2mp-push", f"--path={path}", f"--repo_id=user/{folder.name}"]
 
 
 def collect(folder: Path) -> list[str]:
     return [
-        "collect",
+        "pf2mp-collect",
         "--task=maze_umaze",
         "--n_episodes=2",
         "--n_steps=8",
@@ -129,7 +83,7 @@ def test_an_interrupted_upload_ends_in_one_line_and_succeeds_afterwards(
     before = contents(tmp_path)
     hub.interruptions[:] = [interruption]
     hub.large_files.clear()  # what is there already is not uploaded again
-    code, said = run(arguments)
+    code, said = run(*arguments)
     assert code == 1 and "Traceback" not in said
     (line,) = (line for line in said.splitlines() if line.startswith("error: "))
     assert re.fullmatch(f"error: {told}user/{tmp_path.name} cannot be published: .+", line)
@@ -143,7 +97,7 @@ def test_an_interrupted_upload_ends_in_one_line_and_succeeds_afterwards(
     assert all(name.startswith("data/") for name in after.keys() - before.keys())
 
     hub.interruptions.clear()
-    code, said = run(arguments)
+    code, said = run(*arguments)
     assert code == 0, said
     assert len(repository.commits) == 2
     for name, content in contents(tmp_path / ("policy" if command is push else "data")).items():
@@ -156,7 +110,7 @@ def test_a_short_interruption_is_not_noticed(hub: HubServer, run: Run, tmp_path:
     arguments = push(tmp_path)
     hub.interruptions[:] = [Interruption(LARGE_FILE, n_times=2)]
     hub.large_files.clear()
-    code, said = run(arguments)
+    code, said = run(*arguments)
     assert code == 0, said
     assert hub.interruptions[0].n_times == 0
     assert "model.safetensors" in hub.repositories["model", f"user/{tmp_path.name}"].files()

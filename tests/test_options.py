@@ -96,6 +96,10 @@ def test_other_values_are_yaml() -> None:
     assert found.policies == {"a": "1.10", "b": "x/y"}
     assert found.overwrite is True and found.inner.size == (1.0, 2.5)
     assert found.options == {"n": 3, "deep": {"open": True}}
+    assert parse(Options, ["--options={n: null, deep: {open: null}}"]).options == {
+        "n": None,
+        "deep": {"open": None},
+    }
 
 
 def test_options_of_the_chosen_environment_and_policy_are_read() -> None:
@@ -180,6 +184,7 @@ def test_a_file_that_does_not_exist_or_is_no_file_is_named(tmp_path: Path) -> No
         ("--options=!!python/object/apply:os.system ['id']", "--options must be plain YAML"),
         ("--seed=[", "--seed must be plain YAML, got '\\['"),
         ("--inner.offsets=[null, 0]", r"inner.offsets\[0\] must be float, got null"),
+        ("--policies={a:b/c}", "policies.a:b/c must be str, got null"),
         ("--n_steps=1000000000", "n_steps must be at most 100000, got 1e[+]09"),
         ("--n_steps=1e9", "`n_steps`: Couldn't parse '1e9' into an int"),
     ],
