@@ -30,7 +30,7 @@ def refused(command: str, *options: str, cwd: Path) -> str:
     # LeRobot logs a traceback of its own where a video decoder is missing.
     assert "Traceback" not in finished.stderr.split("torchcodec")[-1]
     before, error, line = finished.stderr.rstrip().rpartition("error: ")
-    assert error and before.endswith(("\n", "")) and (line.count("\n") == 0 or command == "pf2mp-train")
+    assert error and before[-1:] in ("\n", "") and "\n" not in line
     return line
 
 
@@ -56,15 +56,12 @@ def test_no_run_deletes_a_dataset_that_it_did_not_see(tmp_path: Path) -> None:
     ("options", "said"),
     [
         (("--n_steps=1000000000",), "n_steps must be at most 100000, got 1e+09"),
-        (("--task=handwriting_pen", "--n_steps=1000000000"), "n_steps must be at most 100000"),
         (("--obs_type=pixels_agent_pos", "--image_width=1000000000"), "image_width must be at most 8192"),
         (
             ("--obs_type=pixels_agent_pos", "--picture_width=1000000000000"),
             "image_width must be at most 8192",
         ),
         (("--task=fetch_reach", "--n_processes=1000000000"), "n_processes must be at most 256"),
-        (("--task=fetch_reach", "--n_processes=null"), "n_processes must be int, got null"),
-        (("--seed=null",), "seed must be int, got null"),
         (("--action_noise=null",), "action_noise must be float, got null"),
         (("--letter_height=null", "--task=handwriting_pen"), "letter_height must be float, got null"),
         (("--maze_map=#####/#OOG#/#####",), "maze_map must be one of"),
@@ -106,7 +103,6 @@ def test_a_benchmark_that_goes_on_from_a_damaged_run(content: str, said: str, tm
             ("--env.episode_length=1000000000000000000000000000000",),
             "env.episode_length must be at most 1000000",
         ),
-        (("--n_processes=null",), "n_processes must be int, got null"),
     ],
 )
 def test_benchmark(options: tuple[str, ...], said: str, tmp_path: Path) -> None:
