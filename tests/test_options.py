@@ -96,6 +96,7 @@ def test_other_values_are_yaml() -> None:
     assert found.policies == {"a": "1.10", "b": "x/y"}
     assert found.overwrite is True and found.inner.size == (1.0, 2.5)
     assert found.options == {"n": 3, "deep": {"open": True}}
+    assert parse(Options, ["--options={day: 2026-01-01}"]).options == {"day": "2026-01-01"}
     assert parse(Options, ["--options={n: null, deep: {open: null}}"]).options == {
         "n": None,
         "deep": {"open": None},
@@ -124,7 +125,13 @@ def test_texts_in_a_file_arrive_as_they_were_written(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "text"),
-    [("options.json", '{"n_steps": 5}'), ("options.toml", "n_steps = 5"), ("bom.yaml", "\ufeffn_steps: 5")],
+    [
+        ("options.json", '{"n_steps": 5}'),
+        ("options.toml", "n_steps = 5"),
+        ("bom.yaml", "\ufeffn_steps: 5"),
+        ("bom.json", '\ufeff{"n_steps": 5}'),
+        ("bom.toml", "\ufeffn_steps = 5"),
+    ],
 )
 def test_files_of_other_kinds_are_read(name: str, text: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text(text, encoding="utf-8")
