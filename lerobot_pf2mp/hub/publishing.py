@@ -74,8 +74,8 @@ def publish(
 
     Raises:
         OSError: If the Hub cannot be reached or refuses.
-        ValueError: If the repository is to be private and is public already, or the connection breaks. Nothing is published
-            then, and the same call can be repeated.
+        ValueError: If the repository is to be private and is public already, or the connection breaks. Then no file is
+            published or all are, and the same call can be repeated.
     """
     api = HfApi()
     with _publishing(repo_id):
