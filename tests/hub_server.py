@@ -29,6 +29,23 @@ from hub_repository import Answer, Asked, HubError, Repository, RepoType
 from hub_uploads import UPLOADS
 
 
+@dataclass
+class Interruption:
+    """An upload that does not arrive. It counts down by itself.
+
+    Args:
+        path: A part of the path of the requests that it hits, after their method: ``PUT /storage/``.
+        n_bytes: How much of the request's body still arrives; None for all, and the request is done but not answered.
+        n_times: How many requests it hits.
+        is_silent: Whether the connection stays open, without an answer, instead of being closed.
+    """
+
+    path: str
+    n_bytes: int | None = 100
+    n_times: int = 1000
+    is_silent: bool = False
+
+
 @dataclass(frozen=True)
 class Request:
     """What a client asked for, and the status of the answer."""
@@ -48,6 +65,8 @@ class HubServer:
         self.large_files: dict[str, bytes] = {}  # by SHA-256: uploads, whether a commit refers to them or not
         self.broken: set[str] = set()  # repositories at whose mention the connection breaks
         self.cuts: dict[str, int] = {}  # downloads still to be cut in the middle, by the end of the path
+        self.interruptions: list[Interruption] = []
+        self.closing = threading.Event()
         self.requests: list[Request] = []
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), _handler_for(self))
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.05,), daemon=True)
@@ -57,6 +76,7 @@ class HubServer:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.closing.set()
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
@@ -101,6 +121,14 @@ class HubServer:
             "no_proxy": "127.0.0.1",
         }
 
+    def interruption(self, request: str) -> Interruption | None:
+        """What interrupts this request, for example ``PUT /storage/...``; counts it."""
+        for interruption in self.interruptions:
+            if interruption.path in request and interruption.n_times:
+                interruption.n_times -= 1
+                return interruption
+        return None
+
     def is_cut(self, path: str) -> bool:
         """Whether the download of this path breaks off in the middle; counts it."""
         for end, n_left in self.cuts.items():
@@ -133,6 +161,16 @@ def _handler_for(hub: HubServer) -> type[BaseHTTPRequestHandler]:
             """Says nothing: `HubServer.requests` keeps what was asked for."""
 
         def _answer(self, method: str) -> None:
+            interruption = hub.interruption(f"{method} {self.path}")
+            if interruption is not None:
+                if interruption.n_bytes is None:
+                    self._find(method, self._read_body())
+                else:
+                    self.rfile.read(min(interruption.n_bytes, int(self.headers.get("Content-Length") or 0)))
+                if interruption.is_silent:
+                    hub.closing.wait()
+                self.close_connection = True
+                return
             body = self._read_body()
             if any(repo_id in self.path for repo_id in hub.broken):
                 self.close_connection = True

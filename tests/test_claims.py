@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nothing is lost: of two runs with one output one ends, what appears meanwhile is kept, and what a kill left is found."""
 
+import ctypes
 import errno
+import fcntl
+import json
 import logging
 import multiprocessing
 import os
@@ -10,6 +13,7 @@ import signal
 import subprocess
 import sys
 import time
+import types
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -236,6 +240,82 @@ def test_a_full_disk_is_said_and_nothing_is_left(tmp_path: Path) -> None:
     assert process.exitcode == 0
 
 
+@pytest.mark.usefixtures("_way")
+def test_what_exists_is_not_renamed_over(tmp_path: Path) -> None:
+    for name in ("old", "new"):
+        (tmp_path / name).mkdir()
+    with pytest.raises(FileExistsError):
+        renaming.rename_to_new(tmp_path / "old", tmp_path / "new")
+    assert everything_in(tmp_path) == {"old": None, "new": None}
+
+
+@pytest.mark.usefixtures("_way")
+def test_an_exchange_that_fails_leaves_the_old(tmp_path: Path) -> None:
+    (tmp_path / "old").write_text("old")
+    with pytest.raises(FileNotFoundError):
+        renaming.exchange(tmp_path / "missing", tmp_path / "old", tmp_path / "spare")
+    assert everything_in(tmp_path) == {"old": "old"}
+
+
+@pytest.mark.parametrize("code", sorted(renaming._CANNOT))
+def test_a_file_system_that_cannot_rename_so_gets_ordinary_renames(
+    code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> int:
+        ctypes.set_errno(code)
+        return -1
+
+    library = types.SimpleNamespace(renameat2=fail, renamex_np=fail)
+    monkeypatch.setattr(renaming.ctypes, "CDLL", lambda *_, **__: library)
+    write(tmp_path / "data", "first")
+    write(tmp_path / "data", "second", overwrite=True)
+    assert everything_in(tmp_path) == {"data": None, "data/mark": "second"}
+
+
+def test_a_claim_whose_file_is_removed_meanwhile_is_made_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, flock = tmp_path / ".data.claim", fcntl.flock
+
+    def lock_too_late(descriptor: int, operation: int) -> None:
+        monkeypatch.setattr(fcntl, "flock", flock)
+        file.unlink()  # by the one who held it
+        flock(descriptor, operation)
+
+    monkeypatch.setattr(fcntl, "flock", lock_too_late)
+    with claimed(tmp_path / "data"):
+        assert json.loads(file.read_text()) == {"process": os.getpid()}
+        with (
+            pytest.raises(FileExistsError, match="is being written by another process"),
+            claimed(tmp_path / "data"),
+        ):
+            pass
+
+
+def test_without_locks_nothing_is_cleared_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever left it may still be running."""
+
+    def no_locks(*_: object) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", no_locks)
+    workspace_of(tmp_path / "data").mkdir()
+    with claimed(tmp_path / "data"):
+        assert workspace_of(tmp_path / "data").exists()
+
+
+@pytest.mark.parametrize("mark", ["data.abcd_123", ".data.abcd_123.claim"])
+def test_what_belongs_to_another_output_is_not_cleared_up(mark: str, tmp_path: Path) -> None:
+    (tmp_path / mark).touch()
+    left = tmp_path / ".data.abcd_123.partial"  # as versions before 0.2 named what they left of "data"
+    left.mkdir()
+    with claimed(tmp_path / "data"):
+        assert left.exists()
+    (tmp_path / mark).unlink()
+    with claimed(tmp_path / "data"):
+        assert not left.exists()
+
+
 # Signals.
 
 
@@ -243,11 +323,14 @@ def test_a_full_disk_is_said_and_nothing_is_left(tmp_path: Path) -> None:
     ("number", "kind", "code"), [(signal.SIGTERM, Terminated, 143), (signal.SIGHUP, HungUp, 129)]
 )
 def test_a_signal_ends_a_block_like_ctrl_c(number: signal.Signals, kind: type, code: int) -> None:
-    before = signal.getsignal(number)
-    with pytest.raises(kind) as raised, sigterm_like_ctrl_c():
-        signal.raise_signal(number)
-    assert exit_code(raised.value) == code
-    assert signal.getsignal(number) is before
+    outside = signal.signal(number, signal.SIG_DFL)  # under nohup it is ignored
+    try:
+        with pytest.raises(kind) as raised, sigterm_like_ctrl_c():
+            signal.raise_signal(number)
+        assert exit_code(raised.value) == code
+        assert signal.getsignal(number) is signal.SIG_DFL
+    finally:
+        signal.signal(number, outside)
 
 
 def test_a_hang_up_that_is_ignored_stays_so() -> None:

@@ -2,13 +2,12 @@
 """Small inputs that once ended in a traceback, a hang or a loss: each ends in one line, or does what was typed."""
 
 import json
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
-from forked_commands import BIN, run, run_well
+from forked_commands import run, run_well
 from safetensors.torch import load_file, save_file
 from untrained_policies import write_checkpoint
 
@@ -31,7 +30,7 @@ def refused(command: str, *options: str, cwd: Path) -> str:
     # LeRobot logs a traceback of its own where a video decoder is missing.
     assert "Traceback" not in finished.stderr.split("torchcodec")[-1]
     before, error, line = finished.stderr.rstrip().rpartition("error: ")
-    assert error and before.endswith(("\n", "")) and (line.count("\n") == 0 or command == "pf2mp-train")
+    assert error and before[-1:] in ("\n", "") and "\n" not in line
     return line
 
 
@@ -57,15 +56,12 @@ def test_no_run_deletes_a_dataset_that_it_did_not_see(tmp_path: Path) -> None:
     ("options", "said"),
     [
         (("--n_steps=1000000000",), "n_steps must be at most 100000, got 1e+09"),
-        (("--task=handwriting_pen", "--n_steps=1000000000"), "n_steps must be at most 100000"),
         (("--obs_type=pixels_agent_pos", "--image_width=1000000000"), "image_width must be at most 8192"),
         (
             ("--obs_type=pixels_agent_pos", "--picture_width=1000000000000"),
             "image_width must be at most 8192",
         ),
         (("--task=fetch_reach", "--n_processes=1000000000"), "n_processes must be at most 256"),
-        (("--task=fetch_reach", "--n_processes=null"), "n_processes must be int, got null"),
-        (("--seed=null",), "seed must be int, got null"),
         (("--action_noise=null",), "action_noise must be float, got null"),
         (("--letter_height=null", "--task=handwriting_pen"), "letter_height must be float, got null"),
         (("--maze_map=#####/#OOG#/#####",), "maze_map must be one of"),
@@ -107,7 +103,6 @@ def test_a_benchmark_that_goes_on_from_a_damaged_run(content: str, said: str, tm
             ("--env.episode_length=1000000000000000000000000000000",),
             "env.episode_length must be at most 1000000",
         ),
-        (("--n_processes=null",), "n_processes must be int, got null"),
     ],
 )
 def test_benchmark(options: tuple[str, ...], said: str, tmp_path: Path) -> None:
@@ -211,35 +206,3 @@ def test_train(options: tuple[str, ...], said: str, tmp_path: Path) -> None:
     given = [option for option in given if option.partition("=")[0] not in names]
     assert said in refused("pf2mp-train", *given, *options, cwd=tmp_path)
     assert not (tmp_path / "out").exists()
-
-
-FULL = {
-    "collect": ("pf2mp-collect", "--task=maze_umaze", "--n_episodes=20", "--n_steps=40", "--root=out"),
-    "video": (
-        "pf2mp-collect", "--task=maze_umaze", "--n_episodes=2", "--n_steps=40", "--obs_type=pixels_agent_pos", "--root=out"
-    ),
-    "fit-field": (
-        "pf2mp-fit-field", "--policy.path=policy", "--dataset.repo_id=local/maze", "--dataset.root=maze", "--output_dir=out"
-    ),
-    "train-expert": (
-        "pf2mp-train-expert", "--task=fetch_reach", "--total_steps=64", "--output_dir=out",
-        "--options={n_steps: 64, batch_size: 32, n_epochs: 1}",
-    ),
-    "plot": ("pf2mp-plot", "--figure=density", "--checkpoint=policy", "--env.type=pf2mp_maze", "--output=out.png"),
-}  # fmt: skip
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("command", FULL)
-def test_a_full_disk_is_one_line_and_leaves_nothing(command: str, tmp_path: Path) -> None:
-    """A true limit on the size of files: 4 KiB."""
-    write_checkpoint(tmp_path / "policy", "pf2mp")
-    run_well("pf2mp-collect", *COLLECT, "--root=maze", cwd=tmp_path)
-    before = {path.name for path in tmp_path.iterdir()}
-    name, *options = FULL[command]
-    limited = ["bash", "-c", 'ulimit -f 4; exec "$@"', "bash", str(BIN / name), *options]
-    finished = subprocess.run(limited, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300)
-    assert finished.returncode == 1, finished.stderr
-    line = finished.stderr.rstrip().splitlines()[-1]
-    assert line.startswith("error: ") and "File too large" in line
-    assert {path.name for path in tmp_path.iterdir()} == before

@@ -17,6 +17,7 @@ from untrained_policies import write_checkpoint
 
 from lerobot_pf2mp import load_policy
 from lerobot_pf2mp.errors import ConfigError
+from lerobot_pf2mp.policies import processor_files
 from lerobot_pf2mp.policies.processor_files import TRUST_VARIABLE
 
 FILES = ("policy_preprocessor.json", "policy_postprocessor.json")
@@ -113,6 +114,21 @@ def test_a_trusted_step_is_loaded(
     if way == "argument":  # for that call alone
         with pytest.raises(ValueError, match="must be registered"):
             load_policy(checkpoint)
+
+
+def test_the_processors_of_the_main_branch_are_looked_at_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """LeRobot's commands take the processors from there, whatever the revision of the policy."""
+    branches = {branch: write_checkpoint(tmp_path / branch, "pf2mp") for branch in ("main", "tested")}
+    add_step(branches["main"], FILES[0], {"class": "subprocess.Popen", "config": {"args": ["true"]}})
+    monkeypatch.setattr(
+        processor_files,
+        "hf_hub_download",
+        lambda _, name, revision: f"{branches[revision or 'main']}/{name}",
+    )
+    with pytest.raises(ValueError, match="nothing of it was imported"):
+        get_policy_class("pf2mp").from_pretrained("user/policy", revision="tested")
 
 
 @pytest.mark.parametrize(

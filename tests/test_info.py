@@ -6,11 +6,14 @@ import json
 import logging
 import os
 import re
+import shutil
 import subprocess
 import sys
 import sysconfig
+import time
 import venv
 from collections.abc import Callable
+from importlib.machinery import EXTENSION_SUFFIXES
 from importlib.metadata import distribution, version
 from pathlib import Path
 
@@ -18,10 +21,13 @@ import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
+from pf2mp_info import probes
 from pf2mp_info.checkpoint import checkpoint_lines
 from pf2mp_info.trials import LINES
 from pf2mp_info.versions import EXTRAS, ranges
 from untrained_policies import write_checkpoint
+
+from lerobot_pf2mp.density import kernel_tree
 
 ROOT = Path(__file__).parents[1]
 BIN = Path(sys.executable).parent
@@ -299,7 +305,8 @@ def test_the_extras_that_are_recommended_ask_for_their_packages() -> None:
     assert [package for package, _, _ in EXTRAS.values() if not wanted.get(package)] == []
 
 
-BUILD = "install a C compiler, then pip install --force-reinstall --no-deps . in its folder"
+REBUILD = "pip install --force-reinstall --no-deps . in its folder"
+BUILD = f"install a C compiler, then {REBUILD}"
 NO_GPU = {"cores": 2, "gpus": [], "mps": False, "said": ""}
 ENCODERS = {"libx264": "", "libsvtav1": "UnknownCodecError: libsvtav1"}
 
@@ -334,8 +341,17 @@ ENCODERS = {"libx264": "", "libsvtav1": "UnknownCodecError: libsvtav1"}
             ("A, no B", "problem", "AssertionError"),
         ),
         ("rendering", {"backend": "osmesa"}, ("OSMesa", "ok", "")),
-        ("extension", {"is_built": True}, ("compiled", "ok", "")),
-        ("extension", {"is_built": False}, ("not built", "optional", f"fields are slower on a CPU: {BUILD}")),
+        ("extension", {"is_built": True, "is_current": True}, ("compiled", "ok", "")),
+        (
+            "extension",
+            {"is_built": True, "is_current": False},
+            ("compiled from older sources", "optional", REBUILD),
+        ),
+        (
+            "extension",
+            {"is_built": False, "is_current": True},
+            ("not built", "optional", f"fields are slower on a CPU: {BUILD}"),
+        ),
         (
             "extension",
             {"error": "ImportError: no"},
@@ -349,6 +365,27 @@ def test_what_answers_mean_that_this_machine_may_not_give(
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     made = LINES[trial](answer)
     assert (made.name, made.value, made.status, made.remedy) == (trial, *line)
+
+
+@pytest.mark.skipif(not kernel_tree.is_available(), reason="the C extension could not be built")
+@pytest.mark.parametrize("change", ["none", "another interface", "sources changed since", "no sources"])
+def test_an_extension_of_other_sources_is_told(
+    change: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(Path(kernel_tree.__file__).parent, tmp_path / "density")
+    python, c = (tmp_path / "density" / name for name in ("kernel_tree.py", "_kernel_tree.c"))
+    (built,) = (
+        path for path in c.parent.glob("_kernel_tree.*") if path.name.endswith(tuple(EXTENSION_SUFFIXES))
+    )
+    age = 10 if change == "sources changed since" else -10  # [s]
+    c.touch()  # a wheel has none
+    os.utime(c, (time.time(), built.stat().st_mtime + age))
+    if change == "another interface":
+        python.write_text(python.read_text().replace("_INTERFACE = ", "_INTERFACE = 1"))
+    if change == "no sources":
+        c.unlink()
+    monkeypatch.setattr(probes, "_package_folder", lambda: tmp_path)
+    assert probes.extension() == {"is_built": True, "is_current": change in ("none", "no sources")}
 
 
 @pytest.mark.slow

@@ -96,6 +96,11 @@ def test_other_values_are_yaml() -> None:
     assert found.policies == {"a": "1.10", "b": "x/y"}
     assert found.overwrite is True and found.inner.size == (1.0, 2.5)
     assert found.options == {"n": 3, "deep": {"open": True}}
+    assert parse(Options, ["--options={day: 2026-01-01}"]).options == {"day": "2026-01-01"}
+    assert parse(Options, ["--options={n: null, deep: {open: null}}"]).options == {
+        "n": None,
+        "deep": {"open": None},
+    }
 
 
 def test_options_of_the_chosen_environment_and_policy_are_read() -> None:
@@ -120,7 +125,13 @@ def test_texts_in_a_file_arrive_as_they_were_written(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "text"),
-    [("options.json", '{"n_steps": 5}'), ("options.toml", "n_steps = 5"), ("bom.yaml", "\ufeffn_steps: 5")],
+    [
+        ("options.json", '{"n_steps": 5}'),
+        ("options.toml", "n_steps = 5"),
+        ("bom.yaml", "\ufeffn_steps: 5"),
+        ("bom.json", '\ufeff{"n_steps": 5}'),
+        ("bom.toml", "\ufeffn_steps = 5"),
+    ],
 )
 def test_files_of_other_kinds_are_read(name: str, text: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text(text, encoding="utf-8")
@@ -180,6 +191,7 @@ def test_a_file_that_does_not_exist_or_is_no_file_is_named(tmp_path: Path) -> No
         ("--options=!!python/object/apply:os.system ['id']", "--options must be plain YAML"),
         ("--seed=[", "--seed must be plain YAML, got '\\['"),
         ("--inner.offsets=[null, 0]", r"inner.offsets\[0\] must be float, got null"),
+        ("--policies={a:b/c}", "policies.a:b/c must be str, got null"),
         ("--n_steps=1000000000", "n_steps must be at most 100000, got 1e[+]09"),
         ("--n_steps=1e9", "`n_steps`: Couldn't parse '1e9' into an int"),
     ],

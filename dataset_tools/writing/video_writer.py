@@ -47,10 +47,11 @@ def write_video_dataset(
                 n_written += 1
             if not n_written:
                 raise ValueError("a dataset must hold at least one episode, got none that is usable")
+        except BaseException:
+            # Otherwise the encoder continues to write into the folder after its removal.
+            dataset.clear_episode_buffer()
+            raise
         finally:
-            # Also after an error. Otherwise the encoder continues to write into the folder after its removal.
-            if dataset.has_pending_frames():
-                dataset.clear_episode_buffer()
             dataset.finalize()
         write_stats({key: with_exact_constants(stats) for key, stats in dataset.meta.stats.items()}, partial)
         (partial / "README.md").write_text(spec.card, encoding="utf-8")

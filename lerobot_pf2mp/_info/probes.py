@@ -143,13 +143,15 @@ def video() -> dict[str, Any]:
 
 
 def extension() -> dict[str, Any]:
-    """Whether the C extension has been built. An extension that cannot be loaded is an error."""
-    folder = _package_folder()
-    files = [folder / "density" / f"{EXTENSION}{suffix}" for suffix in EXTENSION_SUFFIXES]
+    """Whether the C extension has been built, and from these sources. One that cannot be loaded is an error."""
+    folder = _package_folder() / "density"
+    files = [folder / f"{EXTENSION}{suffix}" for suffix in EXTENSION_SUFFIXES]
     built = [file for file in files if file.exists()]
+    is_current = True
     for file in built[:1]:
-        _module_from(file, EXTENSION)
-    return {"is_built": bool(built)}
+        interface = getattr(_module_from(file, EXTENSION), "INTERFACE", None)
+        is_current = interface == _needed_interface(folder) and not _is_newer(folder / f"{EXTENSION}.c", file)
+    return {"is_built": bool(built), "is_current": is_current}
 
 
 PROBES = {probe.__name__: probe for probe in (discovery, device, extension, simulation, rendering, video)}
@@ -181,6 +183,19 @@ def _package_folder() -> Path:
     if package is None or not package.submodule_search_locations:
         raise ImportError(f"no module named {PACKAGE}")
     return Path(package.submodule_search_locations[0])
+
+
+def _needed_interface(folder: Path) -> int | None:
+    """The interface of the extension that the code calls. It is not imported, because torch may be what is broken."""
+    found = re.search(
+        r"^_INTERFACE = (\d+)$", (folder / "kernel_tree.py").read_text(encoding="utf-8"), re.MULTILINE
+    )
+    return int(found[1]) if found else None
+
+
+def _is_newer(source: Path, built: Path) -> bool:
+    """Whether the sources lie beside the extension, as in a checkout, and have changed since it was built."""
+    return source.exists() and source.stat().st_mtime > built.stat().st_mtime
 
 
 def _module_from(path: Path, name: str) -> ModuleType:

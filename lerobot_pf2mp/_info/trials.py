@@ -77,11 +77,14 @@ def device_line(answer: dict[str, Any]) -> Line:
 
 def extension_line(answer: dict[str, Any]) -> Line:
     """Whether the C extension evaluates potential fields on a CPU."""
-    remedy = "fields are slower on a CPU: install a C compiler, then pip install --force-reinstall --no-deps . in its folder"
+    rebuild = "pip install --force-reinstall --no-deps . in its folder"
+    remedy = f"fields are slower on a CPU: install a C compiler, then {rebuild}"
     if "error" in answer:
         return Line("extension", "cannot be loaded", OPTIONAL, f"{answer['error']}: {remedy}")
     if not answer["is_built"]:
         return Line("extension", "not built", OPTIONAL, remedy)
+    if not answer["is_current"]:
+        return Line("extension", "compiled from older sources", OPTIONAL, rebuild)
     return Line("extension", "compiled")
 
 

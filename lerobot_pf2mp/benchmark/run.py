@@ -67,7 +67,7 @@ def _run(spec: BenchmarkSpec, output_dir: Path, n_processes: int) -> list[Summar
     episodes = output_dir / "episodes.csv"
     rows = read_rows(episodes, EpisodeRow) if episodes.exists() else []
     _refuse_other_checkpoints(rows, jobs, output_dir)
-    _claim(output_dir, spec)
+    _mark_episodes(output_dir, spec)
     # Repeats that were cut short by a kill are run again.
     counts = Counter(map(_identify, rows))
     done = {key for key, count in counts.items() if count == spec.n_episodes}
@@ -151,7 +151,7 @@ def _refuse_other_checkpoints(rows: Sequence[EpisodeRow], jobs: Sequence[Job], o
             )
 
 
-def _claim(output_dir: Path, spec: BenchmarkSpec) -> None:
+def _mark_episodes(output_dir: Path, spec: BenchmarkSpec) -> None:
     """Marks the folder as a benchmark over these episodes, so that a later call can only continue with the same ones."""
     mark = output_dir / "run.json"
     episodes = {

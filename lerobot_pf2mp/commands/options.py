@@ -270,6 +270,15 @@ def _parts(kinds: Sequence[Any], value: Any) -> Iterator[tuple[list[Any], Any, s
         of_items = [item for kind in kinds for item in _item_kinds(kind)]
         for number, item in enumerate(value):
             yield of_items, item, f"[{number}]"
+    elif isinstance(value, dict):
+        of_values = [
+            member
+            for kind in kinds
+            if typing.get_origin(kind) in (dict, Mapping)
+            for member in _members(typing.get_args(kind)[1])
+        ]
+        for key, item in value.items():
+            yield of_values, item, f".{key}"
 
 
 def _merged(below: dict[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:

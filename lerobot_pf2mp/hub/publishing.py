@@ -3,16 +3,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal
 
-from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi
+from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, get_session
+from huggingface_hub.constants import HF_HUB_DOWNLOAD_TIMEOUT
 from huggingface_hub.errors import HFValidationError, RevisionNotFoundError
 from huggingface_hub.utils import validate_repo_id
 
 from lerobot_pf2mp.errors import explained
+
+# How long the Hub may be silent while something is published [s]. `huggingface_hub` itself would wait for ever.
+_SILENCE = float(HF_HUB_DOWNLOAD_TIMEOUT) if "HF_HUB_DOWNLOAD_TIMEOUT" in os.environ else 120.0
 
 
 def check_destination(repo_id: str | None) -> str:
@@ -36,7 +41,7 @@ def check_destination(repo_id: str | None) -> str:
         validate_repo_id(repo_id)
     except HFValidationError as error:
         raise ValueError(f"{rule}: {error}") from error
-    with explained(f"{repo_id} cannot be published"):
+    with _publishing(repo_id):
         HfApi().whoami()
     return repo_id
 
@@ -69,10 +74,11 @@ def publish(
 
     Raises:
         OSError: If the Hub cannot be reached or refuses.
-        ValueError: If the repository is to be private and is public already.
+        ValueError: If the repository is to be private and is public already, or the connection breaks. Then no file is
+            published or all are, and the same call can be repeated.
     """
     api = HfApi()
-    with explained(f"{repo_id} cannot be published"):
+    with _publishing(repo_id):
         url = api.create_repo(repo_id, repo_type=repo_type, private=private, exist_ok=True)
         if private and not api.repo_info(repo_id, repo_type=repo_type).private:
             raise ValueError("it is public already, which --private=true does not change")
@@ -102,3 +108,16 @@ def publish(
                 api.delete_tag(repo_id, repo_type=repo_type, tag=tag)
             api.create_tag(repo_id, repo_type=repo_type, tag=tag, revision=commit.oid)
     return str(url)
+
+
+@contextmanager
+def _publishing(repo_id: str) -> Iterator[None]:
+    """Says of any error of a `with` block what cannot be published, and does not wait for ever for the Hub."""
+    session = get_session()
+    timeout = session.timeout
+    session.timeout = _SILENCE
+    try:
+        with explained(f"{repo_id} cannot be published"):
+            yield
+    finally:
+        session.timeout = timeout

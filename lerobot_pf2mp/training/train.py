@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 from typing import Any
 
+from lerobot.configs import parser
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.factory import make_train_eval_datasets
@@ -25,6 +26,9 @@ def train(limit_gb: float) -> None:
 
     Args:
         limit_gb: Largest dataset kept in memory [GB].
+
+    Raises:
+        ParsingError: If an option cannot have its value.
     """
 
     def make_datasets(config: TrainPipelineConfig) -> tuple[Any, Any]:
@@ -35,6 +39,8 @@ def train(limit_gb: float) -> None:
 
     # The training function gets its data only from here. LeRobot 0.6 has no plug-in point for it.
     lerobot_train.make_train_eval_datasets = make_datasets
+    # LeRobot would print an option that it cannot read in several lines and end. Here it is an error as any other.
+    parser.DecodingError = ()
     lerobot_train.main()
 
 

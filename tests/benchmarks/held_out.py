@@ -91,7 +91,7 @@ def read_symbols(path: Path) -> tuple[Tensor, Tensor]:
 
 
 def read_joints(path: Path) -> tuple[Tensor, Tensor]:
-    """Joint positions of a Panda, one recording, in twenty successive parts."""
+    """Joint positions of a Panda, one recording, in twenty parts."""
     with path.open(newline="") as file:
         rows = list(csv.DictReader((line for line in file if line.strip()), delimiter=";"))
     joints = torch.tensor([[float(row[f"joint_{i}"]) for i in range(1, 8)] for row in rows])
@@ -100,7 +100,7 @@ def read_joints(path: Path) -> tuple[Tensor, Tensor]:
 
 
 def read_tablet(path: Path) -> tuple[Tensor, Tensor]:
-    """Positions of a pen on paper, one recording (x, y, time, status, ... per line), in twenty successive parts."""
+    """Positions of a pen on paper (x, y, time, status, ... after a first line), one recording, in twenty parts."""
     samples = torch.from_numpy(np.loadtxt(path, skiprows=1, dtype=np.float32))
     positions = samples[samples[:, 3] == 1, :2]
     return positions, torch.arange(len(positions)) * 20 // len(positions)

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """DPPF: LeRobot's Diffusion Policy, guided at inference by a potential field (the paper's baseline in Section V)."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

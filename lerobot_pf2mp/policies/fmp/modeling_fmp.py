@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The Flow Matching Policy (Section IV-A of the paper) behind LeRobot's policy interface."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterable
 from typing import Any, Protocol, cast
@@ -115,7 +113,7 @@ class FMPPolicy(OwnPolicy, PreTrainedPolicy):
         """Creates LeRobot's RTC processor from `rtc_config`. LeRobot calls this after it has set that option."""
         rtc_config = self.config.rtc_config
         is_on = rtc_config is not None and rtc_config.enabled
-        self._rtc_processor = RTCProcessor(rtc_config) if is_on else None
+        self.rtc_processor = RTCProcessor(rtc_config) if is_on else None
 
     def forward(self, batch: dict[str, Any], reduction: str = "mean") -> tuple[Tensor, None]:
         """The flow matching loss of a batch (Algorithm 1). In evaluation mode it uses the moving average of the weights.
@@ -212,14 +210,14 @@ class FMPPolicy(OwnPolicy, PreTrainedPolicy):
         **_: Any,
     ) -> Draw:
         """A function that draws chunks for a batch. The observations are encoded once. Arguments as above."""
-        if prev_chunk_left_over is not None and self._rtc_processor is None:
+        if prev_chunk_left_over is not None and self.rtc_processor is None:
             raise ValueError(
                 "prev_chunk_left_over needs rtc_config, got none: call init_rtc_processor() after setting it"
             )
         network = self.inference_network
         encoded = network.encoder(self._observation_window(batch))
         start = self.config.n_obs_steps - 1
-        end = None if self._rtc_processor is not None else start + self.config.n_action_steps
+        end = None if self.rtc_processor is not None else start + self.config.n_action_steps
 
         def draw(
             noise: Tensor | None = None,
@@ -238,8 +236,8 @@ class FMPPolicy(OwnPolicy, PreTrainedPolicy):
             elif tuple(noise.shape) != shape:
                 raise ValueError(f"noise must have shape {shape}, got {tuple(noise.shape)}")
             steer = None
-            if self._rtc_processor is not None and left_over is not None:
-                steer = continuing(self._rtc_processor, left_over, inference_delay, execution_horizon)
+            if self.rtc_processor is not None and left_over is not None:
+                steer = continuing(self.rtc_processor, left_over, inference_delay, execution_horizon)
             chunk = integrate(
                 lambda x_t, t: network(x_t, t, condition),
                 noise.to(device=condition.device, dtype=torch.float32),
@@ -271,7 +269,7 @@ class FMPPolicy(OwnPolicy, PreTrainedPolicy):
         Raises:
             RuntimeError: If real-time chunking is on, because it needs whole chunks.
         """
-        if self._rtc_processor is not None:
+        if self.rtc_processor is not None:
             raise RuntimeError("with real-time chunking use predict_action_chunk instead of select_action")
         observation = {key: value for key, value in batch.items() if key != ACTION}
         if self.config.image_features:

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """PF2MP: the Flow Matching Policy, guided at inference by a potential field (Section IV-B of the paper)."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch
