@@ -4,8 +4,8 @@
     python tests/benchmarks/remaining_collisions.py
 
 runs the very episodes of the benchmarks (same starts, same prior noise, same batch) with the checkpoints and datasets of
-the README, prints what touches where, and draws results/remaining_light.png and results/remaining_dark.png. It takes two
-minutes on one core.
+the README, prints what touches where, and draws results/remaining_light.png and results/remaining_dark.png. It takes a
+minute on one core.
 """
 
 from __future__ import annotations
