@@ -4,9 +4,10 @@
 demo: .venv/installed
 	.venv/bin/pf2mp-demo --output_dir=demo
 
-# Two processes, each of which takes whole files.
-test: .venv/installed
+# Two processes, each of which takes whole files. Then the policies that need transformers.
+test: .venv/installed .venv-vla/installed
 	.venv/bin/pytest --numprocesses=2 --dist=loadfile --no-loadscope-reorder --durations=20
+	.venv-vla/bin/pytest tests/test_guarded_vla.py
 
 test-fast: .venv/installed
 	.venv/bin/pytest --numprocesses=2 --dist=loadfile --no-loadscope-reorder --durations=20 -m "not slow"
@@ -26,10 +27,14 @@ tables:
 	.ci/fill_tables README.md results/ABLATIONS.md results/BENCHMARKS.md results/FAULTS.md
 
 clean:
-	rm -rf .venv .venv-bench demo build *.egg-info
+	rm -rf .venv .venv-bench .venv-vla demo build *.egg-info
 
 .venv/installed: pyproject.toml constraints.txt lerobot_pf2mp/density/_kernel_tree.c
 	@.ci/set_up .venv dev
+
+# Apart from the other tests' environment, like the next one.
+.venv-vla/installed: pyproject.toml constraints.txt lerobot_pf2mp/density/_kernel_tree.c
+	@.ci/set_up .venv-vla vla
 
 # Apart from the tests' environment: with transformers, every command of LeRobot starts 2.5 seconds later.
 .venv-bench/installed: pyproject.toml constraints.txt lerobot_pf2mp/density/_kernel_tree.c

@@ -2,6 +2,8 @@
 """Policies of LeRobot that a potential field guides and checks."""
 
 import json
+import os
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
@@ -9,6 +11,7 @@ from typing import Any, cast
 import draccus
 import pytest
 import torch
+from forked_commands import BIN, SECONDS, run_well
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.policies import make_pre_post_processors
@@ -27,6 +30,7 @@ from lerobot_pf2mp.policies.guarded.generation import N_STEPS_AT_THE_END, Veloci
 from lerobot_pf2mp.policies.guarded.modeling_guarded import GuardedPolicy
 from lerobot_pf2mp.policies.guarded.repeated_rows import repeated_rows
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
+from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
 from lerobot_pf2mp.policies.plans.plans import UnsupportedPlanError
 
 STATE, ENV, ACTION, IMAGE = (
@@ -329,11 +333,6 @@ def test_others_are_drawn_for_the_flagged_robots_only_with_their_own_observation
     batch, seen = field_batch(policy, spread=1e-3), []
     original = policy.base.diffusion.generate_actions
 
-    def near_the_demonstrations(inputs: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        seen.append(inputs[STATE][:, -1])
-        chunk = original(inputs, **kwargs)
-        return 0.5 + 0 * chunk if len(seen) == 1 else chunk
-
     # The first plan of two robots is made to be supported.
     def first_two_supported(inputs: dict[str, Tensor], **kwargs: Any) -> Tensor:
         chunk = original(inputs, **kwargs)
@@ -342,7 +341,6 @@ def test_others_are_drawn_for_the_flagged_robots_only_with_their_own_observation
             chunk[:2] = 0.5
         return chunk
 
-    del near_the_demonstrations
     policy.base.diffusion.generate_actions = first_two_supported
     policy.select_action(batch)
     assert policy.plans is not None
@@ -547,3 +545,210 @@ def test_a_processor_that_is_not_registered_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"subprocess\.Popen"):
         GuardedPolicy.from_pretrained(path)
     assert not (tmp_path / "ran").exists()
+
+
+# As a user does it.
+
+
+@pytest.fixture(scope="module")
+def maze(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("guarded") / "maze"
+    run_well("pf2mp-collect", "--task=maze_umaze", "--n_episodes=20", f"--root={root}")
+    return root
+
+
+SMALL_ACT = (
+    "chunk_size=8",
+    "n_action_steps=8",
+    "dim_model=16",
+    "dim_feedforward=16",
+    "n_heads=2",
+    "use_vae=false",
+)
+EVALUATION = (
+    "--env.type=pf2mp_maze",
+    "--env.task=MazeUMaze-v0",
+    "--eval.n_episodes=2",
+    "--eval.batch_size=2",
+)
+
+
+def train(output: Path, maze: Path, *options: str) -> Path:
+    run_well(
+        "lerobot-train",
+        *options,
+        "--policy.device=cpu",
+        "--policy.push_to_hub=false",
+        "--dataset.repo_id=local/maze",
+        f"--dataset.root={maze}",
+        "--steps=2",
+        "--batch_size=4",
+        "--num_workers=0",
+        "--seed=1",
+        f"--output_dir={output}",
+    )
+    return output / "checkpoints/last/pretrained_model"
+
+
+def fit(checkpoint: Path, output: Path, maze: Path, **options: Any) -> str:
+    arguments = [f"--policy.path={checkpoint}", "--dataset.repo_id=local/maze", f"--dataset.root={maze}"]
+    return run_well("pf2mp-fit-field", *arguments, f"--output_dir={output}", **options)
+
+
+@pytest.mark.slow
+def test_a_policy_is_guarded_by_one_command_and_given_back_by_another(maze, tmp_path):
+    base = train(tmp_path / "act", maze, "--policy.type=act", *(f"--policy.{option}" for option in SMALL_ACT))
+    said = fit(base, tmp_path / "guarded", maze)
+    assert "Wrote a guarded checkpoint" in said
+    weights = (base / "model.safetensors").read_bytes()
+    assert (tmp_path / "guarded/model.safetensors").read_bytes() == weights
+    said = run_well(
+        "lerobot-eval",
+        f"--policy.path={tmp_path / 'guarded'}",
+        *EVALUATION,
+        f"--output_dir={tmp_path / 'eval'}",
+    )
+    assert "Plans are not checked" not in said
+    assert "pc_success" in said
+    back = tmp_path / "back"
+    arguments = (f"--policy.path={tmp_path / 'guarded'}", "--unguard=true", f"--output_dir={back}")
+    said = run_well("pf2mp-fit-field", *arguments)
+    assert "Wrote a checkpoint of type act" in said
+    assert (back / "model.safetensors").read_bytes() == weights
+    assert {path.name for path in back.iterdir()} == {
+        path.name for path in base.iterdir() if path.name != "train_config.json"
+    }
+    written, before = (json.loads((path / "config.json").read_text()) for path in (back, base))
+    assert written == before
+    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+        assert json.loads((back / name).read_text()) == json.loads((base / name).read_text())
+
+
+@pytest.mark.slow
+def test_a_guarded_policy_is_trained_from_the_start_as_its_base_would_be(maze, tmp_path):
+    base = train(tmp_path / "act", maze, "--policy.type=act", *(f"--policy.{option}" for option in SMALL_ACT))
+    new = train(
+        tmp_path / "guarded",
+        maze,
+        "--policy.type=guarded",
+        "--policy.base.type=act",
+        *(f"--policy.base.{option}" for option in SMALL_ACT),
+        "--policy.n_field_points=50",
+    )
+    assert (new / "model.safetensors").read_bytes() == (base / "model.safetensors").read_bytes()
+    _, preprocessor, _ = load_policy(new, device="cpu")
+    (step,) = (step for step in preprocessor.steps if isinstance(step, PotentialFieldProcessorStep))
+    assert len(step.demonstrations) == 50
+
+
+TOY = {
+    "__init__.py": "from . import configuration_toy\n",
+    "configuration_toy.py": '''
+from dataclasses import dataclass, field
+from lerobot.configs import NormalizationMode, PreTrainedConfig
+from lerobot.optim.optimizers import AdamConfig
+
+@PreTrainedConfig.register_subclass("toy")
+@dataclass
+class ToyConfig(PreTrainedConfig):
+    length: int = 8
+    normalization_mapping: dict = field(default_factory=lambda: {"ACTION": NormalizationMode.MIN_MAX})
+    observation_delta_indices = reward_delta_indices = None
+
+    @property
+    def action_delta_indices(self):
+        return list(range(self.length))
+
+    def get_optimizer_preset(self):
+        return AdamConfig()
+
+    def get_scheduler_preset(self):
+        return None
+
+    def validate_features(self):
+        pass
+''',
+    "modeling_toy.py": '''
+import torch
+from lerobot.policies.pretrained import PreTrainedPolicy
+from .configuration_toy import ToyConfig
+
+class ToyPolicy(PreTrainedPolicy):
+    config_class = ToyConfig
+    name = "toy"
+
+    def __init__(self, config, **kwargs):
+        super().__init__(config)
+        self.layer = torch.nn.Linear(2, 2 * config.length)
+
+    def get_optim_params(self):
+        return self.parameters()
+
+    def reset(self):
+        pass
+
+    def predict_action_chunk(self, batch, **kwargs):
+        return self.layer(batch["observation.state"]).unflatten(-1, (-1, 2))
+
+    def select_action(self, batch, **kwargs):
+        return self.predict_action_chunk(batch)[:, 0]
+
+    def forward(self, batch):
+        return (self.predict_action_chunk(batch) - batch["action"]).square().mean(), None
+''',
+    "processor_toy.py": '''
+from lerobot.processor import make_default_pre_post_processors
+
+def make_toy_pre_post_processors(config, dataset_stats=None):
+    return make_default_pre_post_processors(config, dataset_stats)
+''',
+}  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_policy_of_another_plug_in_is_guarded_by_the_same_commands(maze, tmp_path):
+    package = tmp_path / "site/lerobot_policy_toy"
+    (tmp_path / "site/lerobot_policy_toy-1.0.dist-info").mkdir(parents=True)
+    (tmp_path / "site/lerobot_policy_toy-1.0.dist-info/METADATA").write_text(
+        "Metadata-Version: 2.1\nName: lerobot_policy_toy\nVersion: 1.0\n"
+    )
+    package.mkdir()
+    for name, text in TOY.items():
+        (package / name).write_text(text)
+    env = {**os.environ, "PYTHONPATH": str(tmp_path / "site")}
+
+    def run_in_a_process(command: str, *arguments: str) -> str:
+        finished = subprocess.run(
+            [str(BIN / command), *arguments],
+            env=env,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=SECONDS,
+        )
+        assert finished.returncode == 0, finished.stdout[-2000:] + finished.stderr[-4000:]
+        return finished.stdout + finished.stderr
+
+    data = ("--dataset.repo_id=local/maze", f"--dataset.root={maze}")
+    training = ("--steps=2", "--batch_size=4", "--num_workers=0", f"--output_dir={tmp_path / 'toy'}")
+    run_in_a_process(
+        "lerobot-train",
+        "--policy.type=toy",
+        "--policy.device=cpu",
+        "--policy.push_to_hub=false",
+        *data,
+        *training,
+    )
+    base = tmp_path / "toy/checkpoints/last/pretrained_model"
+    said = run_in_a_process(
+        "pf2mp-fit-field", f"--policy.path={base}", *data, f"--output_dir={tmp_path / 'guarded'}"
+    )
+    assert "Wrote a guarded checkpoint" in said
+    said = run_in_a_process(
+        "lerobot-eval",
+        f"--policy.path={tmp_path / 'guarded'}",
+        *EVALUATION,
+        f"--output_dir={tmp_path / 'eval'}",
+    )
+    assert "How toy generates chunks is not known: they are guided when they are finished." in said
+    assert "pc_success" in said

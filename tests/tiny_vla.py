@@ -74,23 +74,24 @@ def tiny_weights() -> Iterator[None]:
     from lerobot.policies.pi05 import modeling_pi05
     from lerobot.processor import tokenizer_processor
     from transformers import CLIPTextConfig, CLIPTextModel
-    from transformers.models.auto.configuration_auto import CONFIG_MAPPING
 
-    class FewLayers(dict[str, Any]):
-        def __getitem__(self, name: str) -> Any:
-            if name != "paligemma":
-                return CONFIG_MAPPING[name]
-            vision = {"hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2, "patch_size": 14}
-            return lambda: CONFIG_MAPPING[name](
-                vision_config={**vision, "model_type": "siglip_vision_model"}, projection_dim=32
-            )
+    make_paligemma = modeling_pi0.PaliGemmaForConditionalGenerationWithPiGemma
+
+    def with_few_weights(config: Any) -> Any:
+        vision = config.vision_config
+        vision.hidden_size = vision.intermediate_size = 16
+        vision.num_hidden_layers, vision.num_attention_heads = 1, 2
+        vision.projection_dim = config.text_config.hidden_size
+        return make_paligemma(config=config)
 
     gemma = modeling_pi0.GemmaConfig(width=32, depth=2, mlp_dim=32, num_heads=2, num_kv_heads=1, head_dim=16)
     clip = CLIPTextConfig(hidden_size=16, intermediate_size=16, num_hidden_layers=1, num_attention_heads=2)
     with ExitStack() as stack:
         for module in (modeling_pi0, modeling_pi05):
             stack.enter_context(patch.object(module, "get_gemma_config", lambda _: gemma))
-            stack.enter_context(patch.object(module, "CONFIG_MAPPING", FewLayers()))
+            stack.enter_context(
+                patch.object(module, "PaliGemmaForConditionalGenerationWithPiGemma", with_few_weights)
+            )
         stack.enter_context(
             patch.object(CLIPTextModel, "from_pretrained", lambda *_, **__: CLIPTextModel(clip))
         )

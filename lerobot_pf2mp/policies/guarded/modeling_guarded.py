@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Any policy of LeRobot, or of a plug-in, guided and checked by a potential field."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

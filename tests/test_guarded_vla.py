@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Vision-language-action policies and multi_task_dit, guarded. They need transformers, see ``make test``."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+import torch
+
+pytest.importorskip("transformers")
+
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import make_pre_post_processors
+from lerobot.policies.factory import get_policy_class
+from lerobot.policies.rtc.configuration_rtc import RTCConfig
+from tiny_vla import ACTION, CHUNK, IMAGE, SIZE, STATE, A, tiny_config, tiny_observation, tiny_weights
+from torch import Tensor
+
+from lerobot_pf2mp import GuardedConfig, load_policy
+from lerobot_pf2mp.policies.guarded.generation import generation_of
+from lerobot_pf2mp.policies.guarded.modeling_guarded import GuardedPolicy
+from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
+from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
+
+KINDS = ("pi0", "pi05", "smolvla", "multi_task_dit, flow_matching", "multi_task_dit, diffusion")
+VLA = KINDS[:3]
+every_kind = pytest.mark.parametrize("kind", KINDS)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_weights() -> Iterator[None]:
+    with tiny_weights():
+        yield
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("vla") / "smolvlm"
+
+
+def guarded(kind: str, folder: Path, **options: Any) -> Any:
+    torch.manual_seed(1)
+    return GuardedPolicy(GuardedConfig(base=tiny_config(kind, folder), **options)).eval()
+
+
+def stock(policy: Any) -> Any:
+    config = policy.config.base_config
+    plain = get_policy_class(config.type)(config).eval()
+    plain.load_state_dict(policy.base.state_dict())
+    return plain
+
+
+def show(shown: DemonstratedActions, policy: Any) -> DemonstratedActions:
+    """Twenty demonstrations near 0.5."""
+    generator = torch.Generator().manual_seed(0)
+    shown.observe(
+        0.5 + 0.05 * torch.randn(20, CHUNK, A, generator=generator),
+        None,
+        CHUNK * torch.arange(20),
+        torch.arange(20),
+        settings=policy.config.field_settings,
+        n_executed=CHUNK,
+    )
+    return shown
+
+
+def field_batch(policy: Any, n_robots: int = 2) -> dict[str, Any]:
+    shown = show(DemonstratedActions(policy.config.field_settings), policy)
+    return {**tiny_observation(n_robots), "potential_field": shown}
+
+
+def selected(policy: Any, batch: dict[str, Any], n_steps: int = CHUNK) -> Tensor:
+    torch.manual_seed(5)
+    policy.reset()
+    return torch.stack([policy.select_action(dict(batch)) for _ in range(n_steps)], dim=1)
+
+
+@every_kind
+def test_without_guidance_and_check_actions_are_bit_for_bit_the_bases(kind, folder):
+    policy = guarded(kind, folder, guidance_scale=0, max_plans=1)
+    assert torch.equal(selected(policy, tiny_observation()), selected(stock(policy), tiny_observation()))
+
+
+@every_kind
+def test_guidance_raises_the_support_of_the_plan_with_as_many_calls_of_the_network(kind, folder):
+    policy = guarded(kind, folder, max_plans=1)
+    calls: list[int] = []
+    network = policy.base.model if kind in VLA else policy.base.noise_predictor
+    inner = network.action_out_proj if kind in VLA else network.output_proj
+    inner.register_forward_hook(lambda *_: calls.append(1))
+    batch = field_batch(policy)
+    field = batch["potential_field"].field(policy.config.field_settings)
+    chunk = selected(policy, batch)
+    n_guided = len(calls)
+    policy.config.guidance_scale = 0
+    unguided = selected(policy, batch)
+    assert len(calls) == 2 * n_guided
+    assert (field.log_density(chunk) >= field.log_density(unguided) - 1e-3).all()
+    assert field.log_density(chunk).mean() > field.log_density(unguided).mean() + 1
+
+
+@every_kind
+def test_each_is_guided_inside_its_steps(kind, folder):
+    where = generation_of(guarded(kind, folder).base).where
+    assert where == "in every " + ("denoising step" if "diffusion" in kind else "integration step")
+
+
+@every_kind
+def test_a_plan_that_leaves_the_demonstrations_is_drawn_again_for_that_robot(kind, folder):
+    policy = guarded(kind, folder, guidance_scale=0, max_plans=3)
+    batch = field_batch(policy)
+    selected(policy, batch, n_steps=1)
+    assert policy.plans.n_drawn.tolist() == [3, 3]
+    assert policy.plans.is_flagged.all()
+    assert not policy._draws_alike
+
+
+@every_kind
+def test_nothing_of_the_base_is_replaced_for_good(kind, folder):
+    policy = guarded(kind, folder)
+    selected(policy, field_batch(policy), n_steps=1)
+    replaced = {"denoise_step", "forward", "predict_action_chunk", "_get_action_chunk"}
+    for module in policy.base.modules():
+        assert not replaced & set(vars(module))
+
+
+def test_smolvla_that_generates_in_other_units_is_guided_at_the_end(folder):
+    policy = guarded("smolvla", folder)
+    policy.base.config.adapt_to_pi_aloha = True
+    assert generation_of(policy.base).where == "on the finished chunk"
+
+
+def test_runge_kutta_steps_are_guided_at_the_end(folder):
+    policy = guarded("multi_task_dit, flow_matching", folder)
+    policy.base.config.integration_method = "rk4"
+    assert generation_of(policy.base).where == "on the finished chunk"
+
+
+@pytest.mark.parametrize("kind", VLA)
+def test_real_time_chunking_continues_the_last_chunk_and_is_guided(kind, folder):
+    policy = guarded(kind, folder, max_plans=1)
+    assert policy.supports_rtc()
+    policy.config.rtc_config = RTCConfig(enabled=True, execution_horizon=4)
+    policy.init_rtc_processor()
+    batch = field_batch(policy)
+    field = batch["potential_field"].field(policy.config.field_settings)
+    torch.manual_seed(5)
+    first = policy.predict_action_chunk(batch)
+    left_over = first[:, 2:]
+    options = {"prev_chunk_left_over": left_over, "inference_delay": 2, "execution_horizon": 4}
+    torch.manual_seed(6)
+    second = policy.predict_action_chunk(dict(batch), **options)
+    torch.manual_seed(6)
+    free = policy.predict_action_chunk(dict(batch))
+    assert second.isfinite().all()
+    assert (second[:, :2] - left_over[:, :2]).norm() < (free[:, :2] - left_over[:, :2]).norm()
+    policy.config.guidance_scale = 0
+    torch.manual_seed(6)
+    unguided = policy.predict_action_chunk(dict(batch), **options)
+    assert field.log_density(second).mean() > field.log_density(unguided).mean()
+
+
+@every_kind
+def test_a_checkpoint_comes_back_with_identical_actions(kind, folder, tmp_path):
+    policy = guarded(kind, folder)
+    stats = {key: {"mean": torch.zeros(A), "std": torch.ones(A)} for key in (STATE, ACTION)}
+    stats |= {key: {"min": -torch.ones(A), "max": torch.ones(A), **stats[key]} for key in (STATE, ACTION)}
+    stats |= {key: {"q01": -torch.ones(A), "q99": torch.ones(A), **stats[key]} for key in (STATE, ACTION)}
+    preprocessor, postprocessor = make_pre_post_processors(policy.config, dataset_stats=stats)
+    step = next(s for s in preprocessor.steps if isinstance(s, PotentialFieldProcessorStep))
+    show(step.demonstrations, policy)
+    for part in (policy, preprocessor, postprocessor):
+        part.save_pretrained(tmp_path)
+    again, preprocess, _ = load_policy(tmp_path, device="cpu")
+    for name, value in policy.base.state_dict().items():
+        assert torch.equal(value, cast(Any, again).base.state_dict()[name])
+    seen = {STATE: torch.zeros(A), IMAGE: torch.zeros(3, SIZE, SIZE), "task": "reach the goal"}
+    batch, other = preprocess(dict(seen)), preprocessor(dict(seen))
+    assert torch.equal(selected(policy, other), selected(again, batch))
+    # The base's own class loads the same file.
+    plain = PreTrainedConfig.from_pretrained(tmp_path).base_config
+    base = get_policy_class(plain.type).from_pretrained(tmp_path, config=plain)
+    for name, value in policy.base.state_dict().items():
+        assert torch.equal(value, base.state_dict()[name])
