@@ -245,7 +245,7 @@ def _observe_plans(
         torch.from_numpy(np.array(numbers[key])).reshape(-1) for key in ("index", "episode_index")
     )
     n_actions = len(delta) + int(delta[0])  # from the current step on
-    n_dropped = min(getattr(config, "drop_n_last_frames", 0), n_actions - 1)
+    n_dropped = min(getattr(config, "drop_n_last_frames", 0) or 0, n_actions - 1)
     n_dropped = max(n_dropped, cast(Any, config).n_action_steps - 1)  # as `DemonstratedActions.observe`
     chosen = choose_plans_of_episodes(episodes, frames, n_dropped)
     if not len(chosen):

@@ -23,9 +23,10 @@ from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
 from torch import Tensor
 from untrained_policies import DENOISING, TRANSFORMER, write_checkpoint
 
-from lerobot_pf2mp import FMPConfig, GuardedConfig, load_policy
+from lerobot_pf2mp import DPPFConfig, FMPConfig, GuardedConfig, load_policy
 from lerobot_pf2mp.errors import ConfigError
 from lerobot_pf2mp.flow_matching import integrate
+from lerobot_pf2mp.policies.dppf.modeling_dppf import DPPFPolicy
 from lerobot_pf2mp.policies.guarded.generation import N_STEPS_AT_THE_END, VelocitySteps, generation_of
 from lerobot_pf2mp.policies.guarded.modeling_guarded import GuardedPolicy
 from lerobot_pf2mp.policies.guarded.repeated_rows import repeated_rows
@@ -313,6 +314,15 @@ def test_guidance_without_a_field_is_an_error():
     with pytest.raises(ValueError, match="guidance needs the potential field"):
         policy = guarded("act")
         policy.select_action(observations(policy))
+
+
+@pytest.mark.parametrize("max_plans", [1, 4])
+def test_a_guarded_diffusion_policy_is_dppf_bit_for_bit(max_plans):
+    policy = guarded("diffusion", max_plans=max_plans)
+    dppf = DPPFPolicy(DPPFConfig(**DENOISING, max_plans=max_plans)).eval()
+    dppf.load_state_dict(policy.base.state_dict())
+    batch = field_batch(policy)
+    assert torch.equal(actions_of(policy, batch), actions_of(dppf, batch))
 
 
 # Checked plans.
@@ -752,3 +762,37 @@ def test_a_policy_of_another_plug_in_is_guarded_by_the_same_commands(maze, tmp_p
     )
     assert "How toy generates chunks is not known: they are guided when they are finished." in said
     assert "pc_success" in said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("collected", "env"),
+    [
+        ("maze_umaze", ("--env.type=pf2mp_maze", "--env.task=MazeUMaze-v0")),
+        ("fetch_reach", ("--env.type=pf2mp_fetch", "--env.task=FetchReachWall-v0")),
+    ],
+)  # fmt: skip
+def test_a_policy_that_sees_images_is_guarded(collected, env, tmp_path):
+    data = tmp_path / "data"
+    run_well(
+        "pf2mp-collect",
+        f"--task={collected}",
+        "--n_episodes=3",
+        "--obs_type=pixels_agent_pos",
+        f"--root={data}",
+    )
+    options = (*SMALL_ACT, "pretrained_backbone_weights=null")
+    base = train(tmp_path / "act", data, "--policy.type=act", *(f"--policy.{option}" for option in options))
+    assert "Wrote a guarded checkpoint" in fit(base, tmp_path / "guarded", data)
+    said = run_well(
+        "lerobot-eval",
+        f"--policy.path={tmp_path / 'guarded'}",
+        *env,
+        "--env.obs_type=pixels_agent_pos",
+        "--eval.n_episodes=1",
+        "--eval.batch_size=1",
+        f"--output_dir={tmp_path / 'eval'}",
+    )
+    assert "pc_success" in said
+    policy, _, _ = load_policy(tmp_path / "guarded", device="cpu")
+    assert policy.config.image_features

@@ -123,7 +123,7 @@ class FieldGuidance:
             dataset_id=self._dataset_id,
             n_past=-first,
             n_executed=self.config.n_action_steps,
-            drop_n_last_frames=getattr(self.config, "drop_n_last_frames", 0),
+            drop_n_last_frames=getattr(self.config, "drop_n_last_frames", 0) or 0,
             states=states,
             places=self._places,
         )
