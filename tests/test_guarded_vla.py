@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Vision-language-action policies and multi_task_dit, guarded. They need transformers, see ``make test``."""
 
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
@@ -10,6 +12,7 @@ import torch
 
 pytest.importorskip("transformers")
 
+from hub_server import HubServer
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
@@ -183,3 +186,68 @@ def test_a_checkpoint_comes_back_with_identical_actions(kind, folder, tmp_path):
     base = get_policy_class(plain.type).from_pretrained(tmp_path, config=plain)
     for name, value in policy.base.state_dict().items():
         assert torch.equal(value, base.state_dict()[name])
+
+
+@pytest.mark.slow
+def test_smolvla_is_trained_guarded_published_and_evaluated_by_the_commands(folder, tmp_path):
+    """Its vision-language model, the guarded checkpoint and everything else come from the Hub."""
+    tiny_config("smolvla", folder)  # writes the vision-language model
+    data, guarded_folder, trained = tmp_path / "data", tmp_path / "guarded", tmp_path / "trained"
+    with HubServer() as hub:
+        hub.add("model", "user/tiny-vlm", folder)
+        hub.users["a token"] = "user"
+        env = hub.environment(tmp_path, token="a token")
+
+        def run(command: str, *arguments: str) -> str:
+            call = [str(Path(sys.executable).parent / command), *arguments]
+            finished = subprocess.run(call, env=env, capture_output=True, text=True, check=False, timeout=600)
+            assert finished.returncode == 0, finished.stdout[-2000:] + finished.stderr[-4000:]
+            return finished.stdout + finished.stderr
+
+        run(
+            "pf2mp-collect",
+            "--task=maze_umaze",
+            "--n_episodes=4",
+            "--obs_type=pixels_agent_pos",
+            f"--root={data}",
+        )
+        dataset = ("--dataset.repo_id=local/maze", f"--dataset.root={data}")
+        policy = {
+            "type": "smolvla",
+            "device": "cpu",
+            "push_to_hub": "false",
+            "vlm_model_name": "user/tiny-vlm",
+            "num_vlm_layers": "2",
+            "num_steps": "2",
+            "resize_imgs_with_padding": f"[{SIZE},{SIZE}]",
+            "chunk_size": "8",
+            "n_action_steps": "8",
+        }
+        run(
+            "lerobot-train",
+            *(f"--policy.{name}={value}" for name, value in policy.items()),
+            *dataset,
+            "--steps=2",
+            "--batch_size=2",
+            "--num_workers=0",
+            f"--output_dir={trained}",
+        )
+        base = trained / "checkpoints/last/pretrained_model"
+        said = run("pf2mp-fit-field", f"--policy.path={base}", *dataset, f"--output_dir={guarded_folder}")
+        assert "Wrote a guarded checkpoint" in said
+        run("pf2mp-push", f"--path={guarded_folder}", "--repo_id=user/guarded")
+        card = hub.repositories["model", "user/guarded"].files()["README.md"].decode()
+        assert "A smolvla policy, guarded by a potential field" in card
+        said = run(
+            "lerobot-eval",
+            "--policy.path=user/guarded",
+            "--env.type=pf2mp_maze",
+            "--env.task=MazeUMaze-v0",
+            "--env.obs_type=pixels_agent_pos",
+            "--eval.n_episodes=1",
+            "--eval.batch_size=1",
+            f"--output_dir={tmp_path / 'eval'}",
+        )
+        assert "pc_success" in said
+        assert "Plans are not checked" not in said
+        assert any("tiny-vlm" in request.path for request in hub.requests)

@@ -43,7 +43,7 @@ def tiny_config(kind: str, folder: Path) -> PreTrainedConfig:
         return make(**_CHUNKS, image_resolution=(SIZE, SIZE), num_inference_steps=3)
     if name == "smolvla":
         if not folder.exists():
-            _write_smolvlm(folder)
+            write_smolvlm(folder)
         return make(
             **_CHUNKS,
             vlm_model_name=str(folder),
@@ -126,29 +126,36 @@ def tiny_tokenizer() -> Any:
     )
 
 
-def _write_smolvlm(folder: Path) -> None:
+def write_smolvlm(
+    folder: Path,
+    text: dict[str, int] | None = None,
+    vision: dict[str, int] | None = None,
+    scale_factor: int = 2,
+) -> None:
+    """Writes what SmolVLA loads of its vision-language model: configuration, image processor and tokenizer.
+
+    Args:
+        folder: The folder to write.
+        text: Sizes of the language model.
+        vision: Sizes of the vision model.
+        scale_factor: By how much it reduces an image's width and height in patches.
+    """
     from transformers import SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor, SmolVLMVideoProcessor
 
+    few: dict[str, int] = {"hidden_size": 16, "intermediate_size": 16, "num_attention_heads": 2}
+    text = text or {
+        **few,
+        "hidden_size": 32,
+        "num_hidden_layers": 2,
+        "num_key_value_heads": 1,
+        "head_dim": 16,
+        "vocab_size": 32,
+    }
+    vision = vision or {**few, "num_hidden_layers": 1, "image_size": SIZE, "patch_size": 14}
     config = SmolVLMConfig(
-        text_config={
-            "model_type": "llama",
-            "hidden_size": 32,
-            "intermediate_size": 32,
-            "num_hidden_layers": 2,
-            "num_attention_heads": 2,
-            "num_key_value_heads": 1,
-            "head_dim": 16,
-            "vocab_size": 32,
-        },
-        vision_config={
-            "hidden_size": 16,
-            "intermediate_size": 16,
-            "num_hidden_layers": 1,
-            "num_attention_heads": 2,
-            "image_size": SIZE,
-            "patch_size": 14,
-        },
-        scale_factor=2,
+        text_config={"model_type": "llama", **text},
+        vision_config=vision,
+        scale_factor=scale_factor,
         image_token_id=3,
         pad_token_id=1,
     )
