@@ -8,10 +8,11 @@ from typing import Any
 
 import grpc
 import pytest
+import torch
 from lerobot.async_inference import policy_server
 from lerobot.async_inference.configs import PolicyServerConfig
 from lerobot.async_inference.helpers import RemotePolicyConfig
-from untrained_policies import write_checkpoint
+from untrained_policies import ENV, STATE, write_checkpoint
 
 from lerobot_pf2mp.serving import GuardedPolicyServer, load_checked_processors
 
@@ -78,6 +79,24 @@ def test_a_second_client_is_refused_until_the_first_is_silent(
     server.Ready(None, OTHER)
     with pytest.raises(AbortedError):
         server.GetActions(None, ROBOT)
+
+
+def test_a_guarded_policy_is_served_with_its_field(
+    server: GuardedPolicyServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(policy_server, "SUPPORTED_POLICIES", ["guarded"])
+    checkpoint = write_checkpoint(tmp_path / "policy", "guarded")
+    server.Ready(None, ROBOT)
+    server.SendPolicyInstructions(instructions("guarded", checkpoint), ROBOT)
+    served: Any = server.policy
+    seen = {STATE: torch.full((2,), 0.9), ENV: torch.zeros(2)}
+    chunk = server._get_action_chunk(server.preprocessor(seen))
+    assert chunk.shape == (1, 4, 2)  # as many actions as the client asked for
+    batch = server.preprocessor(seen)
+    field = batch["potential_field"].field(served.config.field_settings)
+    served.config.guidance_scale = 0
+    unguided = server._get_action_chunk(batch)
+    assert field.log_density(chunk).mean() > field.log_density(unguided).mean()
 
 
 def test_a_served_policy_is_not_replaced(

@@ -4,9 +4,9 @@
     pf2mp-collect --task=maze_large --n_episodes=500 --seed=12345 --root=data/fresh/maze_large
     python tests/benchmarks/plan_check.py --checkpoints='{maze: CHECKPOINT}' --fresh='{maze: data/fresh/maze_large}'
 
-For each name it measures on how many fresh demonstrations the way is flagged, from the start and from a frame drawn at
-random, and how far guidance moves those from the start: a velocity that leads from noise exactly to a demonstration, a
-perfect network, is integrated with the guide of the checkpoint in each region. Distances are in the units of the actions.
+For each name it measures on how many fresh demonstrations the way is flagged, and how far guidance moves them: a velocity
+that leads from noise exactly to a demonstration, a perfect network, is integrated with the guide of the checkpoint in each
+region. Distances are in the units of the actions.
 """
 
 from __future__ import annotations
@@ -80,18 +80,14 @@ def measure(checkpoint: Path, data: Path) -> dict[str, Any]:
     for rate in RATES:
         threshold = demonstrations.plan_threshold(settings, n_actions, rate)
         flagged[rate] = {"kept": threshold.false_alarm_rate, "n_plans": threshold.n_plans}
-    # From the start last: these plans are moved below.
-    for begin in ("random", "start"):
-        states, chunks = plans_of(data, n_actions, preprocessor.steps, at_random=begin == "random")
-        dims = settings.action_dims
-        covered = chunks if dims is None else chunks[..., list(dims)]
-        places = (
-            demonstrations.place_of(states) if demonstrations.starts_at_state(settings) else covered[:, 0]
-        )
-        for rate in RATES:
-            threshold = demonstrations.plan_threshold(settings, n_actions, rate)
-            support = PlanCheck(demonstrations.field(settings), threshold.log_density)(places, covered)
-            flagged[rate][f"flagged_from_{begin}"] = int((support.amin(dim=1) < 0).sum())
+    states, chunks = plans_of(data, n_actions, preprocessor.steps)
+    dims = settings.action_dims
+    covered = chunks if dims is None else chunks[..., list(dims)]
+    places = demonstrations.place_of(states) if demonstrations.starts_at_state(settings) else covered[:, 0]
+    for rate in RATES:
+        threshold = demonstrations.plan_threshold(settings, n_actions, rate)
+        support = PlanCheck(demonstrations.field(settings), threshold.log_density)(places, covered)
+        flagged[rate]["flagged"] = int((support.amin(dim=1) < 0).sum())
     noise = torch.randn(covered.shape, generator=torch.Generator().manual_seed(0))
     moved = {}
     for region, quantile in REGIONS:
@@ -113,19 +109,13 @@ def measure(checkpoint: Path, data: Path) -> dict[str, Any]:
     return {"n_fresh": len(chunks), "n_anchors": n_anchors, "flagged": flagged, "moved": moved}
 
 
-def plans_of(data: Path, n_actions: int, steps: Any, at_random: bool) -> tuple[Tensor, Tensor]:
-    """A normalised state ``(E, A)`` and the actions ``(E, n_actions, A)`` from it on, one of each episode.
-
-    It is the first one, or one drawn at random among those that as many actions follow.
-    """
+def plans_of(data: Path, n_actions: int, steps: Any) -> tuple[Tensor, Tensor]:
+    """The first state ``(E, A)`` of each episode and the actions ``(E, n_actions, A)`` from it on [normalised]."""
     table = LeRobotDataset(f"local/{data.name}", root=data).hf_dataset.with_format("numpy")
     episodes = np.asarray(table["episode_index"][:]).reshape(-1)
     starts = np.flatnonzero(np.diff(episodes, prepend=-1))
     ends = np.append(starts[1:], len(episodes))
-    is_long = ends - starts >= n_actions
-    starts, ends = starts[is_long], ends[is_long]
-    if at_random:
-        starts = np.random.default_rng(0).integers(starts, ends - n_actions + 1)
+    starts = starts[ends - starts >= n_actions]
     actions, states = (
         _normalise(steps, torch.from_numpy(np.asarray(table[key][:], dtype=np.float32)), key)
         for key in (ACTION, OBS_STATE)
@@ -138,20 +128,16 @@ def flagged_table(found: dict[str, Any]) -> str:
 
     def rows() -> Iterator[str]:
         yield (
-            "| task | anchors | demonstrated plans | rate wanted [%] | rate kept [%] | fresh demonstrations flagged [%] | "
-            "from a random frame [%] |"
+            "| task | anchors | demonstrated plans | rate wanted [%] | rate kept [%] | fresh demonstrations flagged [%] |"
         )
-        yield "|---|---|---|---|---|---|---|"
+        yield "|---|---|---|---|---|---|"
         for name, task in found.items():
             for rate, one in task["flagged"].items():
-                cells = []
-                for begin in ("start", "random"):
-                    share = Rate(one[f"flagged_from_{begin}"], task["n_fresh"])
-                    low, high = (100 * end for end in share.interval)
-                    cells.append(f"{100 * share.value:.1f} ({low:.1f} to {high:.1f}) of {task['n_fresh']}")
+                share = Rate(one["flagged"], task["n_fresh"])
+                low, high = (100 * end for end in share.interval)
                 yield (
                     f"| {name} | {task['n_anchors']} | {one['n_plans']} | {100 * rate:g} | {100 * one['kept']:.2g} | "
-                    f"{' | '.join(cells)} |"
+                    f"{100 * share.value:.1f} ({low:.1f} to {high:.1f}) of {task['n_fresh']} |"
                 )
 
     return "\n".join(rows()) + "\n"
