@@ -509,7 +509,7 @@ def test_plot_draws_from_a_checkpoint(
         (["--figure=lambda", "--results=[nowhere]"], "error: "),
         (["--figure=lambda", "--results=[results]", "--task=MazeHuge-v0"], "error: results must be of one task"),
         (["--checkpoint=nowhere"], "error: path must be a checkpoint's pretrained_model folder or a repository"),
-        (["--checkpoint=fmp"], "error: the checkpoint must be of type pf2mp or dppf, got 'fmp'"),
+        (["--checkpoint=fmp"], "error: the checkpoint must be of type pf2mp, dppf or guarded, got 'fmp'"),
         (["--options={guidance_scale: -1}"], "error: the checkpoint pf2mp cannot be loaded: guidance_scale must"),
         (["--options={scale: 1}"], "error: the checkpoint pf2mp cannot be loaded: a pf2mp policy's option must be"),
         (["--env.task=MazeHuge-v0"], "error: task must be one of"),

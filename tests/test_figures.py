@@ -158,7 +158,9 @@ def test_an_environment_that_is_no_maze_has_no_map(checkpoint: str) -> None:
 
 @pytest.mark.parametrize("kind", ["fmp", "diffusion", "act"])
 def test_a_policy_without_guidance_is_refused(tmp_path: Path, kind: str) -> None:
-    with pytest.raises(ValueError, match=f"the checkpoint must be of type pf2mp or dppf, got '{kind}'"):
+    with pytest.raises(
+        ValueError, match=f"the checkpoint must be of type pf2mp, dppf or guarded, got '{kind}'"
+    ):
         figures_of(write_checkpoint(tmp_path / kind, kind))
 
 

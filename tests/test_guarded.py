@@ -23,8 +23,9 @@ from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
 from torch import Tensor
 from untrained_policies import DENOISING, TRANSFORMER, write_checkpoint
 
-from lerobot_pf2mp import DPPFConfig, FMPConfig, GuardedConfig, load_policy
+from lerobot_pf2mp import DPPFConfig, FMPConfig, GuardedConfig, PF2MPMazeEnv, load_policy
 from lerobot_pf2mp.errors import ConfigError
+from lerobot_pf2mp.figures.policy_figures import GuidedPolicyFigures
 from lerobot_pf2mp.flow_matching import integrate
 from lerobot_pf2mp.policies.dppf.modeling_dppf import DPPFPolicy
 from lerobot_pf2mp.policies.guarded.generation import N_STEPS_AT_THE_END, VelocitySteps, generation_of
@@ -435,6 +436,12 @@ def _count_calls(owner: Any, name: str) -> list[int]:
 
     setattr(owner, name, counted)
     return sizes
+
+
+def test_the_steps_of_a_policy_that_has_none_are_not_drawn(tmp_path):
+    figures = GuidedPolicyFigures(write_checkpoint(tmp_path / "guarded", "guarded"), PF2MPMazeEnv(), seed=0)
+    with pytest.raises(ValueError, match="steps of a policy of type pf2mp or dppf, got 'guarded'"):
+        figures.trace_flow(1)
 
 
 # The configuration.

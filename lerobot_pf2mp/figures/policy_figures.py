@@ -68,7 +68,7 @@ def make_support_figure(
     """Draws the support of the demonstrations that a checkpoint holds. It needs no environment and no dataset.
 
     Args:
-        checkpoint: A pf2mp or dppf checkpoint.
+        checkpoint: A pf2mp, dppf or guarded checkpoint.
         output: The PNG file to write.
         options: Changes to the policy's configuration.
         background: light or dark.
@@ -88,7 +88,7 @@ class GuidedPolicyFigures:
     """Figures of one guided policy in one environment.
 
     Args:
-        checkpoint: A pf2mp or dppf checkpoint.
+        checkpoint: A pf2mp, dppf or guarded checkpoint.
         env: The environment.
         seed: Seed of the first episode; episode i has seed + i.
         options: Changes to the policy's configuration.
@@ -105,7 +105,7 @@ class GuidedPolicyFigures:
         )
         if not isinstance(self._policy.config, GuidedConfig):
             raise ValueError(
-                f"the checkpoint must be of type pf2mp or dppf, got {self._policy.config.type!r}"
+                f"the checkpoint must be of type pf2mp, dppf or guarded, got {self._policy.config.type!r}"
             )
         self._config: Any = self._policy.config
         self._env = env
@@ -210,6 +210,10 @@ class GuidedPolicyFigures:
             ``(N + 1, B, T, A)`` chunks without and with guidance [normalised], ``(B, D)`` starts [m], and ``(B, D)`` goals
             [m] or None.
         """
+        if self._config.type not in ("pf2mp", "dppf"):
+            raise ValueError(
+                f"the figure flow shows the steps of a policy of type pf2mp or dppf, got {self._config.type!r}"
+            )
         env = self._make_env(n_chunks)
         observation, _ = env.reset(
             seed=[self._seed + i for i in range(n_chunks)],  # type: ignore[arg-type]
