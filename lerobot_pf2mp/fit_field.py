@@ -41,6 +41,8 @@ from lerobot_pf2mp.process.atomic_files import written_beside
 GUIDED_TYPES = {"fmp": "pf2mp", "pf2mp": "pf2mp", "diffusion": "dppf", "dppf": "dppf", "guarded": "guarded"}
 
 _FRAMES_AT_ONCE = 65536
+# What a guarded policy keeps of the options with which its base is published.
+_KEPT = ("push_to_hub", "repo_id", "private", "tags", "license")
 
 
 def fit_field(
@@ -192,7 +194,8 @@ def _load_dataset(
 
 def _guided_config(config: PreTrainedConfig, options: dict[str, Any]) -> PreTrainedConfig:
     if config.type not in GUIDED_TYPES:
-        return GuardedConfig(base=config, **options)
+        kept = {name: getattr(config, name) for name in _KEPT}
+        return GuardedConfig(base=config, **{**kept, **options})
     guided_class = PreTrainedConfig.get_choice_class(GUIDED_TYPES[config.type])
     values = {field.name: getattr(config, field.name) for field in fields(config) if field.init}
     return guided_class(**{**values, **options})

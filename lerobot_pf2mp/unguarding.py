@@ -11,6 +11,7 @@ from lerobot.policies.factory import get_policy_class
 
 from lerobot_pf2mp.errors import explained
 from lerobot_pf2mp.loading import load_config, load_processors, save_processors
+from lerobot_pf2mp.policies.checked_loading import require_all_weights
 from lerobot_pf2mp.policies.guarded.configuration_guarded import GuardedConfig
 from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
 from lerobot_pf2mp.process.atomic_files import written_beside
@@ -47,6 +48,7 @@ def unguard(
             policy = get_policy_class(plain.type).from_pretrained(
                 str(checkpoint), config=plain, revision=revision
             )
+            require_all_weights(policy, checkpoint, revision)
             preprocessor, postprocessor = load_processors(guided, checkpoint, revision)
         preprocessor.steps = [
             step for step in preprocessor.steps if not isinstance(step, PotentialFieldProcessorStep)

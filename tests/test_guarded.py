@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Policies of LeRobot that a potential field guides and checks."""
 
+import copy
 import json
 import os
 import subprocess
@@ -201,10 +202,23 @@ def test_nothing_of_the_base_is_replaced_for_good(base):
     before = {id(module): dict(vars(module)) for module in policy.base.modules()}
     actions_of(policy, field_batch(policy))
     for module in policy.base.modules():
-        names = set(vars(module)) ^ set(before[id(module)])
-        assert names <= {"_prev_mean", "training"}
-    scheduler = getattr(getattr(policy.base, "diffusion", None), "noise_scheduler", None)
-    assert "Guided" not in type(scheduler).__name__
+        then, now = before[id(module)], vars(module)
+        assert set(then) == set(now)
+        for name, value in now.items():
+            if callable(value) or "scheduler" in name:
+                assert value is then[name]
+
+
+@every_base
+def test_a_copy_is_guarded_by_itself(base):
+    policy = guarded(base, max_plans=2)
+    copied = copy.deepcopy(policy)
+    assert copied.guidance.config is copied.config
+    assert copied.base.config is copied.config.base
+    copied.config.guidance_scale = 0.1
+    copied.config.device = "meta"
+    assert policy.config.guidance_scale == 0.8
+    assert policy.base.config.device == "cpu"
 
 
 def test_a_call_that_fails_leaves_the_base_as_it_was():
@@ -359,6 +373,53 @@ def test_others_are_drawn_for_the_flagged_robots_only_with_their_own_observation
     torch.testing.assert_close(seen[1], batch[STATE][2:].expand(4, -1))
 
 
+@pytest.mark.filterwarnings("ignore:To evaluate in the environment")
+def test_a_policy_that_happened_to_draw_the_same_plan_is_asked_again():
+    policy = guarded("vqbet", guidance_scale=0, max_plans=2)
+    batch = field_batch(policy, n_robots=1, spread=1e-3)
+    constant = torch.zeros(1, N_EXECUTED, A)
+
+    def same(inputs: dict[str, Tensor], rollout: bool) -> Tensor:
+        torch.rand(1)  # it draws its codes
+        return constant.expand(len(inputs[STATE]), -1, -1)
+
+    policy.base.vqbet.forward = same
+    for _ in range(3):
+        policy._queues[ACTION].clear()
+        policy.select_action(batch)
+        assert policy.plans is not None
+        assert policy.plans.n_drawn.tolist() == [2]
+
+
+def test_another_plan_of_a_policy_with_memory_sees_the_same_window_as_the_first():
+    policy = guarded("diffusion", guidance_scale=0, max_plans=3)
+    windows = []
+    original = policy.base.diffusion.generate_actions
+
+    def seen(inputs: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        windows.append(inputs[STATE])
+        return original(inputs, **kwargs)
+
+    policy.base.diffusion.generate_actions = seen
+    shown = field_batch(policy, spread=1e-3)
+    for step in range(N_EXECUTED + 1):
+        policy.select_action({**shown, **observations(policy, seed=step)})
+    assert [len(window) for window in windows] == [3, 6, 3, 6]
+    first, more = windows[2:]
+    assert not torch.equal(first[:, 0], first[:, 1])  # it remembers the observation before
+    torch.testing.assert_close(more, first.repeat_interleave(2, dim=0))
+
+
+def test_a_policy_of_unknown_inputs_is_asked_for_plans_of_the_whole_batch():
+    policy = guarded("diffusion", guidance_scale=0, max_plans=3)
+    policy.base.config.__class__ = type("ElseConfig", (DiffusionConfig,), {"type": "else"})
+    passes = _count_calls(policy.base.diffusion, "conditional_sample")
+    policy.select_action(field_batch(policy, spread=1e-3))
+    assert passes == [3, 3, 3]
+    assert policy.plans is not None
+    assert policy.plans.n_drawn.tolist() == [3, 3, 3]
+
+
 def test_a_policy_that_would_plan_the_same_is_asked_once_and_not_again():
     policy = guarded("act", guidance_scale=0, max_plans=3)
     passes = _count_calls(policy.base, "model")
@@ -502,6 +563,15 @@ def test_lerobots_command_line_makes_one():
             "must plan chunks of actions, got gaussian_actor",
         ),
         (lambda: GuardedConfig(base=ACTConfig(device="cpu"), max_plans=0), "max_plans must be at least 1"),
+        (lambda: GuardedConfig(base=ACTConfig(device="cpu", use_peft=True)), "got act with an adapter"),
+        (
+            lambda: GuardedConfig(base=PreTrainedConfig.get_choice_class("xvla")(device="cpu")),
+            "cannot have the base xvla: LeRobot chooses",
+        ),
+        (
+            lambda: GuardedConfig(base=ACTConfig(device="cpu"), n_obs_steps=2),
+            "give --policy.base.n_obs_steps, got 2 and 1",
+        ),
     ],
 )  # fmt: skip
 def test_what_cannot_be_guarded_is_named(make, message):

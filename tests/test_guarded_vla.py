@@ -17,6 +17,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
+from safetensors.torch import save_file
 from tiny_vla import ACTION, CHUNK, IMAGE, SIZE, STATE, A, tiny_config, tiny_observation, tiny_weights
 from torch import Tensor
 
@@ -144,6 +145,8 @@ def test_runge_kutta_steps_are_guided_at_the_end(folder):
 def test_real_time_chunking_continues_the_last_chunk_and_is_guided(kind, folder):
     policy = guarded(kind, folder, max_plans=1)
     assert policy.supports_rtc()
+    # As LeRobot has it. With fewer steps the correction, whose weight is up to 10, overshoots with or without a guide.
+    setattr(policy.config, "num_steps" if kind == "smolvla" else "num_inference_steps", 10)
     policy.config.rtc_config = RTCConfig(enabled=True, execution_horizon=4)
     policy.init_rtc_processor()
     batch = field_batch(policy)
@@ -162,6 +165,53 @@ def test_real_time_chunking_continues_the_last_chunk_and_is_guided(kind, folder)
     torch.manual_seed(6)
     unguided = policy.predict_action_chunk(dict(batch), **options)
     assert field.log_density(second).mean() > field.log_density(unguided).mean()
+
+
+@pytest.mark.parametrize("time", [1.0, 0.7, 0.1])
+def test_real_time_chunking_does_not_undo_the_guide(time, folder):
+    """The guided velocity is the corrected one of the unguided policy and the offset of the guide."""
+    policy = guarded("pi05", folder, max_plans=1)
+    policy.config.rtc_config = RTCConfig(enabled=True, execution_horizon=6)
+    policy.init_rtc_processor()
+    guide = policy.guidance.guide(field_batch(policy), torch.device("cpu"))
+    generation = generation_of(policy.base)
+    processor = policy.base.model.rtc_processor
+    x_t, left_over, weight = torch.randn(1, CHUNK, A), torch.full((1, CHUNK, A), 0.5), torch.randn(A, A)
+
+    def step() -> Tensor:
+        return processor.denoise_step(
+            x_t=x_t,
+            prev_chunk_left_over=left_over,
+            inference_delay=2,
+            time=time,
+            original_denoise_step_partial=lambda x: x @ weight,
+            execution_horizon=6,
+        )
+
+    unguided = step()
+    with generation.guided(guide):
+        bent = step()
+    assert torch.equal(step(), unguided)
+    dt = 1 / policy.config.num_inference_steps
+    x_next, x_1 = x_t - dt * unguided, x_t - time * (x_t @ weight)
+    torch.testing.assert_close(x_t - dt * bent, guide(x_t, x_next, x_1, dt), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", VLA)
+def test_weights_that_are_not_there_are_an_error(kind, folder, tmp_path):
+    """pi0's own loading goes on with random weights."""
+    policy = guarded(kind, folder)
+    policy.save_pretrained(tmp_path)
+    (tmp_path / "model.safetensors").unlink()
+    with pytest.raises((ValueError, OSError), match=r"model\.safetensors|No such file"):
+        GuardedPolicy.from_pretrained(tmp_path)
+
+
+def test_weights_of_another_network_are_an_error(folder, tmp_path):
+    guarded("pi0", folder).save_pretrained(tmp_path)
+    save_file({"something.else": torch.randn(3)}, tmp_path / "model.safetensors")
+    with pytest.raises(ValueError, match="none of the weights in .* are those of the pi0 policy"):
+        GuardedPolicy.from_pretrained(tmp_path)
 
 
 @every_kind

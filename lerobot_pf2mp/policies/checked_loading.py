@@ -7,6 +7,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any, Self
 
+import torch
 from huggingface_hub import hf_hub_download
 from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.policies.pretrained import (
@@ -18,6 +19,9 @@ from safetensors import safe_open
 
 from lerobot_pf2mp.errors import ConfigError
 from lerobot_pf2mp.policies.processor_files import check_processors
+
+# A tensor of at most so many weights is read to see whether it was loaded.
+_FEW_WEIGHTS = 1_000_000
 
 
 class CheckedLoading:
@@ -37,10 +41,7 @@ class CheckedLoading:
             ValueError: If its processors would run foreign code (see `check_processors`), or weights are missing.
             ConfigError: If it is a checkpoint of another type.
         """
-        revision = kwargs.get("revision")
-        check_processors(pretrained_name_or_path, revision)
-        if revision is not None:
-            check_processors(pretrained_name_or_path)  # LeRobot's commands take them from the main branch
+        check_processors_of(pretrained_name_or_path, kwargs.get("revision"))
         return super().from_pretrained(pretrained_name_or_path, *args, **kwargs)  # type: ignore[misc]
 
     @classmethod
@@ -52,28 +53,52 @@ class CheckedLoading:
         return model
 
 
-def require_all_weights(policy: PreTrainedPolicy, path: str | Path, revision: str | None = None) -> None:
+def check_processors_of(path: str | Path, revision: str | None = None) -> None:
+    """`check_processors`, also of the main branch, from which LeRobot's commands take them whatever the revision."""
+    check_processors(path, revision)
+    if revision is not None:
+        check_processors(path)
+
+
+def require_all_weights(
+    policy: PreTrainedPolicy, path: str | Path, revision: str | None = None, **of_the_hub: Any
+) -> None:
     """Checks that a policy that is not ours got all its weights. LeRobot only logs those that are missing.
 
-    Policies that load their weights in their own way are not checked, because the names in their files may differ.
+    Policies that load their weights in their own way may have other names in their files, and some of them go on with random
+    weights if that fails. Of them, it checks that weights of the file are the policy's.
 
     Args:
         policy: The policy.
         path: The checkpoint from which it was loaded, a folder or a repository on the Hub.
         revision: Branch, tag or commit on the Hub.
+        **of_the_hub: Other arguments of `hf_hub_download`.
 
     Raises:
-        ValueError: If weights are missing.
+        ValueError: If there is no file of weights, or weights are missing.
     """
-    for name in ("from_pretrained", "_load_as_safetensor"):
-        if getattr(type(policy), name).__func__ is not getattr(PreTrainedPolicy, name).__func__:
-            return
     file = Path(path, SAFETENSORS_SINGLE_FILE)
     if not Path(path).is_dir():
-        file = Path(hf_hub_download(str(path), SAFETENSORS_SINGLE_FILE, revision=revision))
+        file = Path(hf_hub_download(str(path), SAFETENSORS_SINGLE_FILE, revision=revision, **of_the_hub))
+    if not file.is_file():
+        raise ValueError(f"the checkpoint must hold {SAFETENSORS_SINGLE_FILE}, got {path} without it")
+    state = policy.state_dict()
+    is_stock = all(
+        getattr(type(policy), name).__func__ is getattr(PreTrainedPolicy, name).__func__
+        for name in ("from_pretrained", "_load_as_safetensor")
+    )
     with safe_open(file, framework="pt") as weights:
         found = set(weights.keys())
-    state = policy.state_dict()
+        if not is_stock:
+            for key in sorted(found):
+                mine = state.get(key, state.get(f"model.{key}"))
+                if mine is not None and mine.ndim and mine.numel() <= _FEW_WEIGHTS:
+                    theirs = weights.get_tensor(key).to(mine)
+                    if torch.equal(theirs, mine) and bool((theirs != theirs.flatten()[0]).any()):
+                        return  # a random or constant start would differ, or be of one value
+            raise ValueError(
+                f"none of the weights in {file} are those of the {policy.name} policy that was loaded"
+            )
     there = {
         state[key].data_ptr() for key in found & set(state)
     }  # of tensors that share memory, one is in the file

@@ -88,7 +88,9 @@ def policy_facts(
 
 def _n_steps(config: Any) -> int | None:
     """The integration or denoising steps of a policy; None if it has none."""
-    for name in ("num_inference_steps", "num_integration_steps", "num_steps", "num_train_timesteps"):
+    if getattr(config, "objective", None) == "flow_matching":
+        return config.num_integration_steps
+    for name in ("num_inference_steps", "num_steps", "num_train_timesteps"):
         if getattr(config, name, None) is not None:
             return getattr(config, name)
     return None

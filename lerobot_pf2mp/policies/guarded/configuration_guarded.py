@@ -19,8 +19,14 @@ _OTHER_WAYS = {
     "dppf": "it is guided already",
     "guarded": "it is guarded already",
 }
-# LeRobot rebuilds their processors by the type of the policy when it loads them.
-_NOT_LOADED_AS_PIPELINES = ("groot", "evo1")
+# Policies that LeRobot treats by their type, which a guarded one has not, or that need more than their saved files.
+_NOT_TO_BE_HELD = {
+    "groot": "LeRobot rebuilds its processors by the policy's type",
+    "evo1": "LeRobot rebuilds its processors by the policy's type",
+    "xvla": "LeRobot chooses the processors of its environments by the policy's type",
+    "fastwam": "it starts from weights that it downloads by itself",
+    "lingbot_va": "its plans go on from those before, so none can be repeated or corrected",
+}
 # Options of all policies that the base's network and processors read too.
 _SHARED = ("input_features", "output_features", "device", "use_amp")
 
@@ -70,9 +76,11 @@ class GuardedConfig(GuidedConfig, PreTrainedConfig):
 
     Args:
         base: The configuration of the policy that is guarded. It must plan chunks of absolute continuous actions.
+        use_amp: Whether to compute in mixed precision; None for the base's choice.
     """
 
     base: UnguardedConfig | None = None
+    use_amp: bool | None = None  # type: ignore[assignment]  # None: as the base
 
     def __post_init__(self) -> None:
         """Takes over what the base has been told, and validates the values.
@@ -91,14 +99,25 @@ class GuardedConfig(GuidedConfig, PreTrainedConfig):
                 raise ValueError(
                     f"a guarded policy's base must be an unguided policy, got {base.type}: {_OTHER_WAYS[base.type]}"
                 )
-            if base.type in _NOT_LOADED_AS_PIPELINES:
+            if base.type in _NOT_TO_BE_HELD:
                 raise ValueError(
-                    f"a guarded policy's base must have processors that LeRobot loads as they were saved, got {base.type}"
+                    f"a guarded policy cannot have the base {base.type}: {_NOT_TO_BE_HELD[base.type]}"
+                )
+            if base.use_peft or self.use_peft:
+                raise ValueError(
+                    f"a guarded policy's base must have whole weights, got {base.type} with an adapter (use_peft): merge "
+                    "the adapter into the weights first"
+                )
+            given_steps: int = vars(self)["n_obs_steps"]
+            if given_steps not in (1, base.n_obs_steps):
+                raise ValueError(
+                    f"n_obs_steps is an option of the base: give --policy.base.n_obs_steps, got {given_steps} and "
+                    f"{base.n_obs_steps}"
                 )
             self.n_obs_steps = base.n_obs_steps
             for name in _SHARED:
-                given = getattr(self, name) or getattr(base, name)
-                setattr(self, name, given)  # and the base's
+                given = getattr(self, name)
+                setattr(self, name, getattr(base, name) if given in (None, {}) else given)  # and the base's
             super().__post_init__()
             check_kinds_and_sizes(self)
             self._validate_guidance()

@@ -12,7 +12,7 @@ What is wrapped is wrapped for one call. Nothing of the base is replaced for goo
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -45,11 +45,12 @@ class Generation(Protocol):
 KNOWN_AT_THE_END = ("act", "pi0_fast", "tdmpc", "vqbet")
 
 
-def generation_of(base: PreTrainedPolicy) -> Generation:
+def generation_of(base: PreTrainedPolicy, n_steps: int | None = None) -> Generation:
     """Where the generation of a policy is guided, under its present options.
 
     Args:
         base: The policy.
+        n_steps: Number of integration steps of this call; None for that of the configuration.
     """
     policy: Any = base
     config = policy.config
@@ -63,7 +64,7 @@ def generation_of(base: PreTrainedPolicy) -> Generation:
             steps = VelocitySteps(config.num_integration_steps, True, action_dim)
             return InIntegrationSteps(policy.noise_predictor, "forward", steps)
         case "pi0" | "pi05":
-            steps = VelocitySteps(config.num_inference_steps, False, action_dim)
+            steps = VelocitySteps(n_steps or config.num_inference_steps, False, action_dim)
             return InIntegrationSteps(policy.model, "denoise_step", steps)
         case "smolvla" if (
             not config.adapt_to_pi_aloha
@@ -127,25 +128,30 @@ class VelocitySteps:
     is_forward: bool
     action_dim: int
 
-    def guided_velocity(self, velocity: Tensor, x_t: Tensor, time: Tensor, guide: Guide) -> Tensor:
+    def guided_velocity(
+        self, velocity: Tensor, x_t: Tensor, time: Tensor, guide: Guide, predicted: Tensor | None = None
+    ) -> Tensor:
         """The velocity v' with which the unguided step from x_t becomes the guided one.
 
         With time from 1 to 0, x_next = x_t - dt v and x_1 = x_t - t v; forward, x_next = x_t + dt v and
         x_1 = x_t + (1 - t) v. In both, v' - v is the offset of the guided point divided by the signed dt. No gradient runs
-        through the offset: the correction of real-time chunking, which differentiates v', is that of the unguided policy.
+        through it.
 
         Args:
-            velocity: ``(B, T, A')`` the network's velocity at x_t, A' >= A.
+            velocity: ``(B, T, A')`` the velocity of the step, A' >= A.
             x_t: ``(B, T, A')`` the start of the step.
             time: ``(B,)`` or ``()`` the time at which it starts.
             guide: The guide.
+            predicted: ``(B, T, A')`` the velocity that leads to the end point x_1, if that is another one: the network's,
+                when real-time chunking has corrected the step's.
         """
         with torch.no_grad():
             dt = 1 / self.n_steps
             sign, left = (1, 1 - time) if self.is_forward else (-1, time)
-            x, v = (value.detach()[..., : self.action_dim].float() for value in (x_t, velocity))
+            end = velocity if predicted is None else predicted
+            x, v, v_end = (value.detach()[..., : self.action_dim].float() for value in (x_t, velocity, end))
             x_next = x + sign * dt * v
-            x_1 = x + sign * left.to(x).reshape(-1, 1, 1) * v
+            x_1 = x + sign * left.to(x).reshape(-1, 1, 1) * v_end
             offset = (guide(x, x_next, x_1, dt) - x_next) / (sign * dt)
             offset = torch.nn.functional.pad(offset, (0, velocity.shape[-1] - self.action_dim))
         return velocity + offset.to(velocity.dtype)
@@ -166,24 +172,60 @@ class InIntegrationSteps:
     steps: VelocitySteps
     where = "in every integration step"
 
-    @contextmanager
-    def guided(self, guide: Guide | None) -> Iterator[None]:
-        """Wraps the method of this one module."""
-        if guide is None:
-            yield
-            return
-        velocity = getattr(self.owner, self.method)
+    def guided(self, guide: Guide | None) -> AbstractContextManager[None]:
+        """Wraps the method of this one module, or the step of its processor for real-time chunking if that is on.
 
+        The processor corrects a velocity by the end point to which it leads. If that were the guided one, the correction
+        would undo the guidance, and more.
+        """
+        if guide is None:
+            return nullcontext()
+        processor = getattr(self.owner, "rtc_processor", None)
+        if processor is not None and self.owner._rtc_enabled():
+            return replaced(processor, "denoise_step", self._corrected(processor.denoise_step, guide))
+        return replaced(self.owner, self.method, self._plain(getattr(self.owner, self.method), guide))
+
+    def _plain(self, velocity: Callable[..., Tensor], guide: Guide) -> Callable[..., Tensor]:
         def guided_velocity(*args: Any, **kwargs: Any) -> Tensor:
             x_t, time = args[:2] if args else (kwargs["x_t"], kwargs["timestep"])
             return self.steps.guided_velocity(velocity(*args, **kwargs), x_t, time, guide)
 
-        setattr(self.owner, self.method, guided_velocity)
-        try:
-            yield
-        finally:
-            delattr(self.owner, self.method)  # the class's own shows again
+        return guided_velocity
+
+    def _corrected(self, correct: Callable[..., Tensor], guide: Guide) -> Callable[..., Tensor]:
+        """The same for `RTCProcessor.denoise_step`, which calls the network's velocity once and corrects it."""
+
+        def guided_velocity(
+            *,
+            x_t: Tensor,
+            time: float,
+            original_denoise_step_partial: Callable[[Tensor], Tensor],
+            **kwargs: Any,
+        ) -> Tensor:
+            predicted: list[Tensor] = []
+
+            def velocity(x: Tensor) -> Tensor:
+                predicted.append(original_denoise_step_partial(x))
+                return predicted[-1]
+
+            corrected = correct(x_t=x_t, time=time, original_denoise_step_partial=velocity, **kwargs)
+            return self.steps.guided_velocity(corrected, x_t, torch.as_tensor(time), guide, predicted[-1])
+
+        return guided_velocity
 
     def finished(self, chunk: Tensor, guide: Guide | None) -> Tensor:
         """The chunk itself."""
         return chunk
+
+
+@contextmanager
+def replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
+    """A block in which an attribute of one object has another value. It is as before after the block."""
+    before = vars(owner).get(name)
+    setattr(owner, name, value)
+    try:
+        yield
+    finally:
+        delattr(owner, name)  # the class's own shows again
+        if before is not None:
+            setattr(owner, name, before)

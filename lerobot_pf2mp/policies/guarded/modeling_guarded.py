@@ -5,7 +5,7 @@ import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NoReturn, Self
 
 import torch
 from lerobot.policies import PreTrainedPolicy
@@ -14,14 +14,17 @@ from torch import Tensor
 
 from lerobot_pf2mp.flow_matching import Guide
 from lerobot_pf2mp.policies.batch_keys import POTENTIAL_FIELD
-from lerobot_pf2mp.policies.checked_loading import require_all_weights, require_own_config
+from lerobot_pf2mp.policies.checked_loading import (
+    check_processors_of,
+    require_all_weights,
+    require_own_config,
+)
 from lerobot_pf2mp.policies.guarded.configuration_guarded import GuardedConfig
-from lerobot_pf2mp.policies.guarded.generation import KNOWN_AT_THE_END, AtTheEnd, generation_of
+from lerobot_pf2mp.policies.guarded.generation import KNOWN_AT_THE_END, AtTheEnd, generation_of, replaced
 from lerobot_pf2mp.policies.guarded.repeated_rows import repeated_queues, repeated_rows
 from lerobot_pf2mp.policies.guided.field_guidance import FieldGuidance
 from lerobot_pf2mp.policies.own_policy import OwnPolicy
 from lerobot_pf2mp.policies.plans.plans import Plans
-from lerobot_pf2mp.policies.processor_files import check_processors
 
 logger = logging.getLogger(__name__)
 
@@ -30,6 +33,8 @@ _PREFIX = "base."
 _CHUNK_METHODS = {"smolvla": "_get_action_chunk"}
 # Policies whose generation continues their last one, so that none can be repeated.
 _NOT_REPEATABLE = ("tdmpc",)
+# Policies whose inputs are known to have a row for each robot. Others are asked for plans of the whole batch, one by one.
+_WITH_ROWS = ("act", "diffusion", "multi_task_dit", "pi0", "pi05", "pi0_fast", "smolvla", "vqbet")
 # Policies whose chunks have the time first, ``(T, B, A)``.
 _TIME_FIRST = ("tdmpc",)
 
@@ -73,7 +78,7 @@ class GuardedPolicy(OwnPolicy, PreTrainedPolicy):
         self.base = base
         self.guidance = FieldGuidance(config, dataset_stats, dataset_meta)
         self._is_time_first = config.base_config.type in _TIME_FIRST
-        # Whether the base would draw the same plan again, as it has been seen to do.
+        # Whether the base would plan the same again, as it has been seen to do without drawing random numbers.
         self._draws_alike = config.base_config.type in _NOT_REPEATABLE
         # While the base selects an action: its function that generates chunks, and how many actions it executes of one.
         self._selecting: tuple[Callable[..., Tensor], int] | None = None
@@ -113,13 +118,13 @@ class GuardedPolicy(OwnPolicy, PreTrainedPolicy):
             ConfigError: If it is a checkpoint of another type.
         """
         revision = kwargs.get("revision")
-        check_processors(pretrained_name_or_path, revision)
-        if revision is not None:
-            check_processors(pretrained_name_or_path)  # LeRobot's commands take them from the main branch
+        check_processors_of(pretrained_name_or_path, revision)
+        of_the_hub = {key: kwargs[key] for key in ("cache_dir", "local_files_only", "token") if key in kwargs}
         if config is None:
-            config = GuardedConfig.from_pretrained(pretrained_name_or_path, revision=revision)
+            config = GuardedConfig.from_pretrained(pretrained_name_or_path, revision=revision, **of_the_hub)
         require_own_config(cls, config)
         base_class = get_policy_class(config.base_config.type)
+        config.base_config.pretrained_path = Path(pretrained_name_or_path)  # as LeRobot's commands set it
         base = base_class.from_pretrained(
             pretrained_name_or_path,
             config=config.base_config,
@@ -127,7 +132,7 @@ class GuardedPolicy(OwnPolicy, PreTrainedPolicy):
             dataset_meta=dataset_meta,
             **kwargs,
         )
-        require_all_weights(base, pretrained_name_or_path, revision)
+        require_all_weights(base, pretrained_name_or_path, revision, **of_the_hub)
         policy = cls(config, dataset_stats, dataset_meta, base=base)
         policy.to(config.device)
         policy.eval()
@@ -136,8 +141,22 @@ class GuardedPolicy(OwnPolicy, PreTrainedPolicy):
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
         if state_dict is not None:
             state_dict = {key.removeprefix(_PREFIX): value for key, value in state_dict.items()}
-        self.base._save_pretrained(save_directory, state_dict)
-        self.config._save_pretrained(save_directory)  # in place of the base's
+        with replaced(
+            self.config.base_config, "pretrained_path", None
+        ):  # where it came from is of no use elsewhere
+            self.base._save_pretrained(save_directory, state_dict)
+            self.config._save_pretrained(save_directory)  # in place of the base's
+
+    def wrap_with_peft(self, *args: Any, **kwargs: Any) -> NoReturn:
+        """Refuses adapters.
+
+        Raises:
+            ValueError: Always.
+        """
+        raise ValueError(
+            "a guarded policy must be trained whole, got --peft options: train its base with them, merge the adapter into "
+            "the weights, and guard the result with pf2mp-fit-field"
+        )
 
     def get_optim_params(self) -> Any:
         """The base's."""
@@ -148,6 +167,7 @@ class GuardedPolicy(OwnPolicy, PreTrainedPolicy):
         self.base.reset()
         self.guidance.reset()
         self._has_planned = False
+        self._draws_alike = self.config.base_config.type in _NOT_REPEATABLE  # its options may have changed
 
     def supports_rtc(self) -> bool:
         """Whether the base does real-time chunking."""
@@ -175,7 +195,8 @@ class GuardedPolicy(OwnPolicy, PreTrainedPolicy):
             UnsupportedPlanError: With ``on_unsupported=stop``, if no plan stays in the demonstrated region.
         """
         self.guidance.begin(kwargs.get("prev_chunk_left_over"), kwargs.get("inference_delay") or 0)
-        guide, generation, inputs = self._guide(batch), generation_of(self.base), _without_field(batch)
+        guide, inputs = self._guide(batch), _without_field(batch)
+        generation = generation_of(self.base, kwargs.get("num_steps"))
         generate, n_executed = self._selecting or (self.base.predict_action_chunk, None)
 
         def draw(inputs: dict[str, Any], *args: Any, **kwargs: Any) -> Tensor:
@@ -188,11 +209,21 @@ class GuardedPolicy(OwnPolicy, PreTrainedPolicy):
         chunk = draw(inputs, *args, **kwargs)
 
         def draw_more(rows: Tensor, n_each: int) -> Tensor:
-            selection = (rows, n_each, len(chunk))
             others = {key: value for key, value in kwargs.items() if key != "noise"}  # that of the first plan
-            with repeated_queues(self.base, *selection):
-                plans = draw(repeated_rows(inputs, *selection), **repeated_rows(others, *selection))
-            self._draws_alike = _are_alike(plans.unflatten(0, (len(rows), n_each)), chunk[rows])
+            before = random_state(chunk.device)
+            if self.config.base_config.type in _WITH_ROWS:
+                selection = (rows, n_each, len(chunk))
+                left_over = others.get("prev_chunk_left_over")
+                if isinstance(left_over, Tensor) and left_over.ndim == 2:
+                    others["prev_chunk_left_over"] = left_over.unsqueeze(0)  # it has no row for each robot
+                with repeated_queues(self.base, *selection):
+                    plans = draw(repeated_rows(inputs, *selection), **repeated_rows(others, *selection))
+            else:
+                plans = torch.stack([draw(inputs, **others)[rows] for _ in range(n_each)], dim=1).flatten(
+                    0, 1
+                )
+            is_alike = _are_alike(plans.unflatten(0, (len(rows), n_each)), chunk[rows])
+            self._draws_alike = is_alike and torch.equal(before, random_state(chunk.device))
             return plans
 
         chunk = self.guidance.choose(batch, chunk, None if self._draws_alike else draw_more)
@@ -234,7 +265,7 @@ class GuardedPolicy(OwnPolicy, PreTrainedPolicy):
             yield  # only its mean over several chunks is executed
             return
         name = _CHUNK_METHODS.get(self.config.base_config.type, "predict_action_chunk")
-        generate, replaced = getattr(self.base, name), vars(self.base).get(name)
+        generate = getattr(self.base, name)
         field = {key: value for key, value in batch.items() if key == POTENTIAL_FIELD}
 
         def planned(inputs: dict[str, Any], *args: Any, **kwargs: Any) -> Tensor:
@@ -245,17 +276,17 @@ class GuardedPolicy(OwnPolicy, PreTrainedPolicy):
             finally:
                 self._selecting = None
 
-        setattr(self.base, name, planned)
-        try:
+        with replaced(self.base, name, planned):
             yield
-        finally:
-            delattr(self.base, name)  # the class's own shows again
-            if replaced is not None:
-                setattr(self.base, name, replaced)
 
 
 def _without_field(batch: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in batch.items() if key != POTENTIAL_FIELD}
+
+
+def random_state(device: torch.device) -> Tensor:
+    """The state of the generator that draws random numbers on a device."""
+    return torch.cuda.get_rng_state(device) if device.type == "cuda" else torch.get_rng_state()
 
 
 def _are_alike(plans: Tensor, first: Tensor) -> bool:
