@@ -141,9 +141,8 @@ class GuardedPolicy(OwnPolicy, PreTrainedPolicy):
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
         if state_dict is not None:
             state_dict = {key.removeprefix(_PREFIX): value for key, value in state_dict.items()}
-        with replaced(
-            self.config.base_config, "pretrained_path", None
-        ):  # where it came from is of no use elsewhere
+        # Where the base came from is of no use elsewhere.
+        with replaced(self.config.base_config, "pretrained_path", None):
             self.base._save_pretrained(save_directory, state_dict)
             self.config._save_pretrained(save_directory)  # in place of the base's
 
@@ -167,7 +166,6 @@ class GuardedPolicy(OwnPolicy, PreTrainedPolicy):
         self.base.reset()
         self.guidance.reset()
         self._has_planned = False
-        self._draws_alike = self.config.base_config.type in _NOT_REPEATABLE  # its options may have changed
 
     def supports_rtc(self) -> bool:
         """Whether the base does real-time chunking."""
@@ -219,9 +217,8 @@ class GuardedPolicy(OwnPolicy, PreTrainedPolicy):
                 with repeated_queues(self.base, *selection):
                     plans = draw(repeated_rows(inputs, *selection), **repeated_rows(others, *selection))
             else:
-                plans = torch.stack([draw(inputs, **others)[rows] for _ in range(n_each)], dim=1).flatten(
-                    0, 1
-                )
+                plans = torch.cat([draw(inputs, **others)[rows].unsqueeze(1) for _ in range(n_each)], dim=1)
+                plans = plans.flatten(0, 1)
             is_alike = _are_alike(plans.unflatten(0, (len(rows), n_each)), chunk[rows])
             self._draws_alike = is_alike and torch.equal(before, random_state(chunk.device))
             return plans
