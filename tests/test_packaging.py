@@ -41,6 +41,7 @@ for name in ("fmp", "pf2mp", "dppf"):
 assert "pf2mp_maze" in EnvConfig.get_known_choices()
 assert "lerobot_pf2mp/MazeLarge-v0" in gymnasium.registry
 import lerobot_pf2mp.dataset_tools.maze.collect_maze
+assert get_policy_class("guarded").name == "guarded"
 print("discovered")
 """
 
@@ -75,6 +76,19 @@ def test_constraints_name_every_package_that_is_asked_for() -> None:
     assert asked_for - constrained == {canonicalize_name(project["name"])}
 
 
+def test_every_folder_of_code_is_packaged() -> None:
+    tool = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    folders = {
+        f"lerobot_pf2mp.{path.parent.relative_to(ROOT / top)}".replace("/", ".").removesuffix("..")
+        if top == "lerobot_pf2mp"
+        else ".".join(("lerobot_pf2mp", *path.parent.relative_to(ROOT).parts))
+        for top in ("lerobot_pf2mp", "dataset_tools")
+        for path in (ROOT / top).rglob("__init__.py")
+    }
+    moved = {"lerobot_pf2mp._info": "pf2mp_info"}
+    assert {moved.get(folder, folder) for folder in folders} <= set(tool["packages"])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("path", sorted((ROOT / "eval_configs").rglob("*.yaml")), ids=lambda path: path.stem)
 def test_configuration_files_are_valid(path: Path) -> None:
@@ -83,7 +97,8 @@ def test_configuration_files_are_valid(path: Path) -> None:
     if path.stem.startswith("train_"):
         config = draccus.parse(TrainPipelineConfig, path, args=[])
         (horizon,) = (steps for task, steps in HORIZONS.items() if task in path.stem)
-        assert config.policy.horizon == horizon
+        policy = config.policy
+        assert (policy.chunk_size if policy.type == "act" else policy.horizon) == horizon
     elif "policies" in content:
         spec = make_spec(draccus.parse(BenchmarkConfig, path, args=[]))
         for changes in spec.variants.values():
