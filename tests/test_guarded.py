@@ -28,12 +28,12 @@ from lerobot_pf2mp import DPPFConfig, FMPConfig, GuardedConfig, PF2MPMazeEnv, lo
 from lerobot_pf2mp.errors import ConfigError
 from lerobot_pf2mp.figures.policy_figures import GuidedPolicyFigures
 from lerobot_pf2mp.flow_matching import integrate
+from lerobot_pf2mp.loading import loaded_demonstrations
 from lerobot_pf2mp.policies.dppf.modeling_dppf import DPPFPolicy
 from lerobot_pf2mp.policies.guarded.generation import N_STEPS_AT_THE_END, VelocitySteps, generation_of
 from lerobot_pf2mp.policies.guarded.modeling_guarded import GuardedPolicy
 from lerobot_pf2mp.policies.guarded.repeated_rows import repeated_rows
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
-from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
 from lerobot_pf2mp.policies.plans.plans import UnsupportedPlanError
 
 STATE, ENV, ACTION, IMAGE = (
@@ -723,9 +723,23 @@ def test_a_guarded_policy_is_trained_from_the_start_as_its_base_would_be(maze, t
         "--policy.n_field_points=50",
     )
     assert (new / "model.safetensors").read_bytes() == (base / "model.safetensors").read_bytes()
-    _, preprocessor, _ = load_policy(new, device="cpu")
-    (step,) = (step for step in preprocessor.steps if isinstance(step, PotentialFieldProcessorStep))
-    assert len(step.demonstrations) == 50
+    shown = demonstrations_of(new)
+    assert len(shown) == 50
+    # Resumed, the field goes on with what it has.
+    run_well("lerobot-train", f"--config_path={new / 'train_config.json'}", "--resume=true", "--steps=3")
+    resumed = set(demonstrations_of(new).frames.tolist())
+    assert resumed & set(shown.frames.tolist())
+    assert resumed - set(shown.frames.tolist())
+    # Fine-tuned on other episodes, it holds only those.
+    tuned = train(tmp_path / "tuned", maze, f"--policy.path={new}", "--dataset.episodes=[3,4]")
+    episodes = demonstrations_of(tuned).episodes
+    assert episodes is not None
+    assert set(episodes.tolist()) == {3, 4}
+
+
+def demonstrations_of(checkpoint: Path) -> DemonstratedActions:
+    _, preprocessor, _ = load_policy(checkpoint, device="cpu")
+    return loaded_demonstrations(preprocessor)
 
 
 TOY = {

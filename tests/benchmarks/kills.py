@@ -18,7 +18,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import draccus
@@ -70,6 +70,8 @@ class KillsConfig:
     n_kills: int = 50
     # Seed of the moments.
     seed: int = 0
+    # Only these commands; all by default.
+    only: list[str] = field(default_factory=list)
     # Folder for table.md.
     output_dir: Path = Path("results/kills")
 
@@ -88,6 +90,8 @@ def main(config: KillsConfig) -> None:
         seeds.mkdir()
         make_seeds(seeds)
         for name, (options, varying) in COMMANDS.items():
+            if config.only and name not in config.only:
+                continue
             here = Path(folder) / name.replace(", ", "_").replace(" ", "_")
             options = [option.replace("SEEDS", str(seeds)) for option in options]
             lines.append(kill_often(name, options, varying, here, rng, config.n_kills))
