@@ -121,7 +121,7 @@ def test_unknown_options_end_with_the_usage_and_nothing_written(tmp_path: Path) 
         (
             "pf2mp-fit-field",
             [
-                "diffusion becomes dppf, fmp becomes pf2mp",
+                "fmp becomes pf2mp, diffusion dppf, all others guarded",
                 "[normalised action units], or likelihood, scott or silverman",
                 "lambda, the strength of the guidance",
                 "--policy.path",
