@@ -590,7 +590,7 @@ def test_bad_arguments_of_push_end_in_one_line(checkpoint, tmp_path, refused):
         figure.write_bytes(b"picture")
     assert "a.png twice" in refused("push", path, here, f"--figures=[{twice[0]},{twice[1]}]")
     diffusion = make_checkpoint(tmp_path / "act", "diffusion")
-    assert "type must be one of ['fmp', 'pf2mp', 'dppf'], got 'diffusion'" in refused(
+    assert "type must be one of ['fmp', 'pf2mp', 'dppf', 'guarded'], got 'diffusion'" in refused(
         "push", f"--path={diffusion}", here
     )
 
