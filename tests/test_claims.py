@@ -357,7 +357,9 @@ def test_a_second_ctrl_c_does_not_interrupt_the_clean_up() -> None:
 
 def test_a_ctrl_c_during_the_last_steps_comes_after_them() -> None:
     steps = []
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have told the tests to ignore it
+    before = signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # a shell may have told the tests to ignore it
     try:
         with pytest.raises(KeyboardInterrupt):
             with uninterrupted():
