@@ -9,7 +9,8 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.sampler import EpisodeAwareSampler
 
-from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, write_dataset
+from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, image_feature, write_dataset
+from lerobot_pf2mp.dataset_tools.writing.video_writer import write_video_dataset
 from lerobot_pf2mp.training.in_memory_dataset import InMemoryDataset, fits_in_memory
 
 FPS = 10
@@ -24,6 +25,7 @@ FEATURES: dict[str, dict[str, Any]] = {
     **{f"vector.{dtype}": {"dtype": dtype, "shape": (2,), "names": None} for dtype in DTYPES},
     **{f"number.{dtype}": {"dtype": dtype, "shape": (1,), "names": None} for dtype in DTYPES},
 }
+VIDEO_FEATURES = {"observation.images.front": image_feature((64, 80))}
 WINDOWS = {
     "no_window": None,
     "actions": {"action": [i / FPS for i in range(8)]},
@@ -107,6 +109,48 @@ def test_matrices_equal_those_of_lerobots_dataset(tmp_path, shape):
     dataset = LeRobotDataset("test/tiny", tmp_path / "tiny", delta_timestamps={"matrix": [-0.1, 0.0, 0.1]})
     assert fits_in_memory(dataset, 1e9)
     assert_same(InMemoryDataset(dataset)[0], dataset[0])
+
+
+@pytest.fixture(scope="module")
+def video_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    rng = np.random.default_rng(0)
+    features = {**VIDEO_FEATURES, "action": FEATURES["action"]}
+    episodes = [
+        {
+            "observation.images.front": rng.integers(0, 255, (length, 64, 80, 3), dtype=np.uint8),
+            "action": random_values(rng, "float32", (length, 2)),
+        }
+        for length in (5, 3, 4)
+    ]
+    folder = tmp_path_factory.mktemp("datasets") / "video"
+    write_video_dataset(folder, DatasetSpec("test/video", FPS, features, "Do it.", "A card."), episodes)
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("return_uint8", [True, False], ids=["uint8", "float"])
+@pytest.mark.parametrize("episodes", [None, [0, 2]], ids=str)
+@pytest.mark.parametrize("images", [None, [0.0], [-0.1, 0.0]], ids=str)
+def test_every_image_equals_that_of_lerobots_dataset(video_root, images, episodes, return_uint8):
+    windows = {"action": [0.0, 0.1, 0.2]} | ({} if images is None else {"observation.images.front": images})
+    dataset = LeRobotDataset(
+        "test/video", video_root, delta_timestamps=windows, episodes=episodes, return_uint8=return_uint8
+    )
+    in_memory = InMemoryDataset(dataset)
+    for row in range(len(dataset)):
+        assert_same(in_memory[row], dataset[row])
+
+
+@pytest.mark.slow
+def test_a_video_counts_with_its_decoded_size_and_not_at_all_if_it_is_augmented(video_root):
+    dataset = LeRobotDataset("test/video", video_root, return_uint8=True)
+    decoded = len(dataset) * 64 * 80 * 3
+    assert fits_in_memory(dataset, 2 * decoded)
+    assert not fits_in_memory(dataset, decoded)
+    dataset.set_image_transforms(lambda image: image)
+    assert not fits_in_memory(dataset, 1e9)
+    with pytest.raises(ValueError, match="without image transforms"):
+        InMemoryDataset(dataset)
 
 
 def test_windows_reach_beyond_the_episode_on_both_sides_and_say_so(root):

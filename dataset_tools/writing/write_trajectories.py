@@ -54,13 +54,14 @@ def write_trajectories(
     prepared = prepare(trajectories, n_steps, collides, dropped)
     usable = islice(({key: frames[key] for key in spec.features} for frames in prepared), n_episodes)
     # Closed here, not by the garbage collector, so that an interrupted bar is not drawn again at the end.
-    with closing(_with_progress(usable, n_episodes or n_expected)) as episodes:
+    with closing(with_progress(usable, n_episodes or n_expected)) as episodes:
         write = write_video_dataset if has_images(spec) else write_dataset
         n_written = write(root, spec, episodes, overwrite=overwrite)
     return n_written, dropped
 
 
-def _with_progress(
+def with_progress(
     episodes: Iterable[dict[str, np.ndarray]], total: int | None
 ) -> Generator[dict[str, np.ndarray]]:
+    """The episodes, while a bar shows how many there were. `total` is their number, if it is known."""
     yield from tqdm(episodes, total=total, desc="Writing", unit="episode", mininterval=1.0)

@@ -38,6 +38,7 @@ def register_with_lerobot() -> None:
     import lerobot_pf2mp.envs.configs.fetch
     import lerobot_pf2mp.envs.configs.handwriting
     import lerobot_pf2mp.envs.configs.maze
+    import lerobot_pf2mp.envs.configs.so101
     import lerobot_pf2mp.policies.dppf.configuration_dppf
     import lerobot_pf2mp.policies.fmp.configuration_fmp
     import lerobot_pf2mp.policies.guarded.configuration_guarded
@@ -69,6 +70,13 @@ def register_gym_environments() -> None:
                     max_episode_steps=max_episode_steps,
                     kwargs={"env_class": env_class, argument: value},
                 )
+    for name, (so101_class, n_steps) in tasks.SO101_CLASSES.items():
+        if f"{PACKAGE}/{name}" not in gymnasium.registry:
+            gymnasium.register(
+                id=f"{PACKAGE}/{name}",
+                entry_point=f"{PACKAGE}.envs.so101.{so101_class}",
+                max_episode_steps=n_steps,
+            )
 
 
 def _once_imported(package: str, call: Callable[[], None]) -> None:

@@ -18,6 +18,8 @@ from lerobot_pf2mp.envs.tasks import (
     MAZE_OF_TASK,
     MAZE_STEPS,
     OBS_TYPES,
+    SO101_STEPS,
+    SO101_TASK,
     SPACE_OF_TASK,
 )
 
@@ -36,19 +38,21 @@ class CollectConfig(WritingConfig):
         pf2mp-collect --task=fetch_reach --expert=outputs/expert_reach --root=data/fetch_reach_ppo
         pf2mp-collect --task=handwriting_joint --letter=S --n_episodes=20 --root=data/handwriting_S
         pf2mp-collect --task=handwriting_pen --scene_file=my_stroke.json --root=data/my_stroke
+        pf2mp-collect --task=so101_fence --obs_type=pixels_agent_pos --image_width=96 --root=data/so101_fence
     """
 
-    # Task to demonstrate: maze_umaze, maze_medium, maze_large, fetch_reach, fetch_push, handwriting_joint or
-    # handwriting_pen.
+    # Task to demonstrate: maze_umaze, maze_medium, maze_large, fetch_reach, fetch_push, handwriting_joint,
+    # handwriting_pen or so101_fence.
     task: str = "maze_large"
     # Folder of the dataset; by default where LeRobot keeps the datasets of your Hub account.
     root: Path | None = None
     # Name of the dataset, user/name; by default local/TASK.
     repo_id: str | None = None
     # Demonstrations to write; by default 4000 for a maze, 1000 for Fetch, 20 for handwriting_joint, 10 for
-    # handwriting_pen.
+    # handwriting_pen, 200 for so101_fence.
     n_episodes: int | None = None
-    # Steps that each demonstration is resampled to; by default 80 for a maze, 48 for Fetch, 64 for handwriting.
+    # Steps that each demonstration is resampled to; by default 80 for a maze, 48 for Fetch, 64 for handwriting; always 96
+    # for so101_fence, which is not resampled.
     n_steps: int | None = None
     # Mazes: standard deviation of the noise on the expert's force, relative to the largest force (100 N).
     action_noise: float = 0.0
@@ -56,7 +60,8 @@ class CollectConfig(WritingConfig):
     maze_map: str | None = None
     # Fetch: scripted, or the folder of an expert that pf2mp-train-expert trained in the same scene.
     expert: str = "scripted"
-    # Fetch: distance of the scripted expert to the wall: clear (2 to 5 cm) or hug (2 to 10 mm).
+    # Fetch: distance of the scripted expert to the wall: clear (2 to 5 cm) or hug (2 to 10 mm). SO-101: height of the cube
+    # above it: clear (15 to 35 mm) or hug (4 to 12 mm).
     style: str = "clear"
     # Fetch: the wall, and the ranges of positions of the gripper, the goal and the block.
     scene: SceneConfig = field(default_factory=SceneConfig)
@@ -94,8 +99,10 @@ def _collect(config: CollectConfig) -> None:
         _collect_fetch(config, FETCH_OF_TASK[config.task])
     elif config.task in SPACE_OF_TASK:
         _collect_handwriting(config, SPACE_OF_TASK[config.task])
+    elif config.task == SO101_TASK:
+        _collect_so101(config)
     else:
-        tasks = [*MAZE_OF_TASK, *FETCH_OF_TASK, *SPACE_OF_TASK]
+        tasks = [*MAZE_OF_TASK, *FETCH_OF_TASK, *SPACE_OF_TASK, SO101_TASK]
         raise ValueError(f"task must be one of {tasks}, got {config.task!r}")
 
 
@@ -152,3 +159,22 @@ def _collect_handwriting(config: CollectConfig, space: str) -> None:
         seed=config.seed,
     )
     write_and_report(config, config.task, HANDWRITING_STEPS, write)
+
+
+def _collect_so101(config: CollectConfig) -> None:
+    # First, because it says what to install.
+    from lerobot_pf2mp.envs.so101.needs import check_so101
+
+    check_so101()
+    from lerobot_pf2mp.dataset_tools.so101.collect_so101 import collect_so101
+
+    if config.expert != "scripted":
+        raise ValueError(f"expert must be scripted for {SO101_TASK}, got {config.expert!r}")
+    write = partial(
+        collect_so101,
+        n_episodes=200 if config.n_episodes is None else config.n_episodes,
+        style=config.style,
+        image_width=_image_width(config),
+        seed=config.seed,
+    )
+    write_and_report(config, config.task, SO101_STEPS, write)

@@ -20,12 +20,12 @@ DEFAULT_MEMORY_LIMIT_GB = 4.0
 USAGE = f"""\
 usage: pf2mp-train [{MEMORY_LIMIT_OPTION}=GB] [{TRUST_OPTION}=CLASS,...] [options of lerobot-train]
 
-lerobot-train, but datasets without images are kept in memory, which trains small networks many times faster. Options,
-configuration, checkpoints, logs, resumption, batches and their order are the same.
+lerobot-train, but small datasets are kept in memory, their videos decoded, which trains small networks many times faster.
+Options, configuration, checkpoints, logs, resumption, batches and their order are the same.
 
   {TRUST_OPTION}=CLASS,...       Processor steps of a checkpoint that may be imported although they are not registered.
-  {MEMORY_LIMIT_OPTION}=GB  Largest dataset kept in memory [GB]; beyond it, and with images or streaming, the loader is
-                          LeRobot's own. (default: {DEFAULT_MEMORY_LIMIT_GB:g})
+  {MEMORY_LIMIT_OPTION}=GB  Largest dataset kept in memory [GB]; beyond it, and with streaming or image transforms, the
+                          loader is LeRobot's own. (default: {DEFAULT_MEMORY_LIMIT_GB:g})
 
 Examples:
   pf2mp-train --config_path=eval_configs/train_maze_large_small.yaml --dataset.root=data/maze_large \\

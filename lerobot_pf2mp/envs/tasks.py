@@ -9,9 +9,17 @@ MAZE_TASKS = {"MazeUMaze-v0": "umaze", "MazeMedium-v0": "medium", "MazeLarge-v0"
 FETCH_TASKS = {"FetchReachWall-v0": "reach", "FetchPushWall-v0": "push"}
 HANDWRITING_TASKS = {"HandwritingJoint-v0": "joint", "HandwritingPen-v0": "pen"}
 
+# Keys: the names for Gymnasium. The second one is what so101-nexus' robot drives, for as long as it likes.
+SO101_STEPS = 96
+SO101_CLASSES: dict[str, tuple[str, int | None]] = {
+    "SO101Fence-v0": ("fence_env:SO101FenceEnv", SO101_STEPS),
+    "SO101FenceSimulation-v0": ("fence_simulation:FenceSimulation", None),
+}
+
 # Keys: the names for pf2mp-collect and pf2mp-convert. Values: the same as above.
 MAZE_OF_TASK = {"maze_umaze": "umaze", "maze_medium": "medium", "maze_large": "large"}
 FETCH_OF_TASK = {"fetch_reach": "reach", "fetch_push": "push"}
+SO101_TASK = "so101_fence"
 SPACE_OF_TASK = {"handwriting_joint": "joint", "handwriting_pen": "pen"}
 
 MAZE_STEPS = 80

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A LeRobotDataset without cameras in memory. It returns the same samples, hundreds of times faster."""
+"""A LeRobotDataset in memory. It returns the same samples, many times faster."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from lerobot.datasets.feature_utils import get_delta_indices
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 from torch.utils.data._utils.collate import default_collate_fn_map
+from tqdm import tqdm
 
 
 class _Sample(dict[str, Any]):
@@ -66,21 +67,25 @@ class InMemoryDataset(torch.utils.data.Dataset):
     All other attributes are those of the wrapped dataset.
 
     Args:
-        dataset: A dataset without cameras and with numeric features.
+        dataset: A dataset with numeric features and videos. Videos are decoded once, here, with a progress bar.
 
     Raises:
         ValueError: If the dataset cannot be held in memory, see `fits_in_memory`.
     """
 
     def __init__(self, dataset: LeRobotDataset) -> None:
-        if not _is_numeric(dataset):
-            raise ValueError(f"an in-memory dataset must be numeric, got {dataset.meta.features}")
+        if not _can_be_held(dataset):
+            raise ValueError(
+                f"an in-memory dataset must have numeric features and videos without image transforms, got "
+                f"{dataset.meta.features}"
+            )
         self._dataset = dataset
         table = dataset.hf_dataset.with_format("arrow")[:]
         features = dataset.meta.features
         self._columns = {
             key: _to_tensor(table.column(key), features[key]["shape"]) for key in table.column_names
         }
+        self._columns |= _decoded_videos(dataset, self._columns["episode_index"], self._columns["timestamp"])
         self._tasks = list(dataset.meta.tasks.index)
         self._task_of_row = self._columns["task_index"].tolist()
         windows = get_delta_indices(dataset.delta_timestamps or {}, dataset.meta.fps)
@@ -119,27 +124,68 @@ class InMemoryDataset(torch.utils.data.Dataset):
             # index_select takes half the time of indexing with a (B, T) tensor.
             values = self._columns[key].index_select(0, found.flatten())
             batch[key] = values.unflatten(0, found.shape)
+            if key in self._dataset.meta.video_keys and len(deltas) == 1:
+                batch[key] = batch[key].squeeze(1)  # as LeRobot's reader does for videos
         return SampleBatch(batch, [self._tasks[self._task_of_row[row]] for row in index.tolist()])
 
 
 def fits_in_memory(dataset: Any, limit_bytes: float) -> bool:
-    """Whether a dataset can be served by `InMemoryDataset`: numeric, without cameras, and within a limit.
+    """Whether a dataset can be served by `InMemoryDataset`: numeric features and videos, within a limit.
 
     Args:
         dataset: A map-style LeRobotDataset. Anything else does not fit.
         limit_bytes: Largest memory that its frames may take [bytes].
     """
-    if not isinstance(dataset, LeRobotDataset) or not _is_numeric(dataset):
+    if not isinstance(dataset, LeRobotDataset) or not _can_be_held(dataset):
         return False
-    widths = [int(np.prod(feature["shape"])) for feature in dataset.meta.features.values()]
-    return dataset.num_frames * 8 * sum(widths) <= limit_bytes
+    videos = dataset.meta.video_keys
+    sizes = {key: int(np.prod(feature["shape"])) for key, feature in dataset.meta.features.items()}
+    bytes_a_value = 1 if dataset._return_uint8 else 4
+    n_bytes = sum(size * (bytes_a_value if key in videos else 8) for key, size in sizes.items())
+    return dataset.num_frames * n_bytes <= limit_bytes
 
 
-def _is_numeric(dataset: LeRobotDataset) -> bool:
-    return not dataset.meta.camera_keys and all(
+def _can_be_held(dataset: LeRobotDataset) -> bool:
+    """Whether every feature is numeric or a video of colours, and samples are always the same."""
+    meta = dataset.meta
+    if (
+        dataset.image_transforms is not None
+        or set(meta.camera_keys) != set(meta.video_keys)
+        or meta.depth_keys
+    ):
+        return False
+    return all(
         feature["dtype"].startswith(("float", "int", "bool", "uint"))
-        for feature in dataset.meta.features.values()
+        for key, feature in meta.features.items()
+        if key not in meta.video_keys
     )
+
+
+def _decoded_videos(dataset: LeRobotDataset, episodes: Tensor, timestamps: Tensor) -> dict[str, Tensor]:
+    """All frames ``(N, C, H, W)`` of each video, decoded by LeRobot's reader.
+
+    Args:
+        dataset: The dataset.
+        episodes: ``(N,)`` the episode of each frame, in the order of the dataset.
+        timestamps: ``(N,)`` the time of each frame in its episode [s].
+    """
+    keys = dataset.meta.video_keys
+    if not keys:
+        return {}
+    frames: dict[str, Tensor] = {}
+    numbers = episodes.unique_consecutive().tolist()
+    for number in tqdm(numbers, desc="Decoding videos", unit="episode", mininterval=1.0):
+        rows = (episodes == number).nonzero().flatten()
+        times = timestamps[rows].tolist()
+        decoded = dataset.reader._query_videos(dict.fromkeys(keys, times), number)
+        for key, images in decoded.items():
+            images = images.reshape(
+                len(rows), *images.shape[-3:]
+            )  # the reader drops the axis of a single frame
+            if key not in frames:
+                frames[key] = images.new_empty((len(episodes), *images.shape[1:]))
+            frames[key][rows] = images
+    return frames
 
 
 def _to_tensor(column: Any, feature_shape: tuple[int, ...]) -> Tensor:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""LeRobot's own training function, with low-dimensional datasets in memory.
+"""LeRobot's own training function, with small datasets in memory.
 
 Reading one sample with an action window costs LeRobot's loader about 14 ms, many times the training step of a small
-network. The options, configuration, checkpoints, logs and resumption are those of ``lerobot-train``, and so are the
-batches and their order.
+network, and decoding its images some more. The options, configuration, checkpoints, logs and resumption are those of
+``lerobot-train``, and so are the batches and their order.
 """
 
 from __future__ import annotations
@@ -70,7 +70,8 @@ def _in_memory(config: TrainPipelineConfig, dataset: Any, limit_bytes: float) ->
     if dataset is None or not fits_in_memory(dataset, limit_bytes):
         if dataset is not None:
             logging.info(
-                "The dataset has images, is streamed or is too large for memory: LeRobot's loader reads it."
+                "The dataset is streamed, augmented, has images that are not videos, or is too large for memory: LeRobot's "
+                "loader reads it."
             )
         return dataset
     # Worker processes would only copy the data in memory.
