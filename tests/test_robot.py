@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -241,3 +242,79 @@ def test_the_server_says_what_is_missing(monkeypatch: pytest.MonkeyPatch, capsys
         r'^error: pf2mp-policy-server needs: pip install "lerobot_policy_pf2mp\[async\]"',
         capsys.readouterr().err,
     )
+
+
+@pytest.mark.skipif(find_spec("so101_nexus") is None, reason="needs the extra so101")
+def test_a_guarded_act_moves_a_simulated_so101_with_lerobots_own_commands(tmp_path: Path) -> None:
+    from so101_nexus.lerobot_adapter.synthetic_calibration import write_synthetic_calibration
+
+    from lerobot_pf2mp.dataset_tools.so101.collect_so101 import collect_so101
+
+    root = tmp_path / "data"
+    options = {"style": "clear", "seed": 0, "overwrite": False, "image_width": 64}
+    collect_so101(root=root, repo_id="local/data", n_episodes=2, n_steps=96, **options)
+    dataset = ("--dataset.repo_id=local/data", f"--dataset.root={root}")
+    sizes = ("--policy.dim_model=16", "--policy.dim_feedforward=16", "--policy.n_heads=2")
+    run_well(
+        "lerobot-train",
+        "--policy.type=act",
+        "--policy.device=cpu",
+        "--policy.push_to_hub=false",
+        "--policy.pretrained_backbone_weights=null",
+        "--policy.chunk_size=8",
+        "--policy.n_action_steps=8",
+        *sizes,
+        *dataset,
+        f"--output_dir={tmp_path / 'act'}",
+        "--batch_size=2",
+        "--num_workers=0",
+        "--steps=2",
+    )
+    run_well(
+        "pf2mp-fit-field",
+        f"--policy.path={tmp_path / 'act/checkpoints/last/pretrained_model'}",
+        "--policy.field_action_dims=[0,1,2,3,4]",
+        *dataset,
+        f"--output_dir={tmp_path / 'guarded'}",
+    )
+    write_synthetic_calibration(tmp_path / "calibration", "sim")
+    recorded = {}
+    for scale in (0.8, 0.0):
+        folder = tmp_path / f"rollout_{scale}"
+        run_well(
+            "lerobot-rollout",
+            f"--policy.path={tmp_path / 'guarded'}",
+            f"--policy.guidance_scale={scale}",
+            "--device=cpu",
+            "--strategy.type=sentry",
+            "--dataset.repo_id=local/rollout_seen",
+            f"--dataset.root={folder}",
+            "--dataset.single_task=Carry the cube.",
+            "--dataset.push_to_hub=false",
+            "--dataset.no_stamp=true",
+            "--dataset.fps=20",
+            "--robot.type=sim_so_follower",
+            "--robot.discover_packages_path=so101_nexus.lerobot_adapter",
+            "--robot.id=sim",
+            f"--robot.calibration_dir={tmp_path / 'calibration'}",
+            "--robot.env_id=lerobot_pf2mp/SO101FenceSimulation-v0",
+            "--robot.env_kwargs={image_size: [64, 64]}",
+            "--robot.seed=0",
+            "--robot.cameras={front: {type: sim, source: front, width: 64, height: 64, fps: 20}}",
+            "--fps=20",
+            "--duration=4",
+            "--play_sounds=false",
+            "--return_to_initial_position=false",
+        )
+        recorded[scale] = np.asarray(
+            LeRobotDataset("local/rollout_seen", root=folder).hf_dataset.with_format("numpy")["action"][:]
+        )
+    demonstrated = np.asarray(
+        LeRobotDataset("local/data", root=root).hf_dataset.with_format("numpy")["action"][:]
+    )
+    distances = {
+        scale: np.linalg.norm(actions[:, None, :5] - demonstrated[None, :, :5], axis=-1).min(axis=1).mean()
+        for scale, actions in recorded.items()
+    }
+    assert len(recorded[0.8]) >= 8
+    assert distances[0.8] < 0.5 * distances[0.0]  # [degrees]

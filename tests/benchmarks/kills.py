@@ -85,6 +85,7 @@ def main(config: KillsConfig) -> None:
         "left after that |",
         "|---|---|---|---|---|---|---|---|",
     ]
+    output_dir.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="kills-") as folder:
         seeds = Path(folder) / "seeds"
         seeds.mkdir()
@@ -95,8 +96,7 @@ def main(config: KillsConfig) -> None:
             here = Path(folder) / name.replace(", ", "_").replace(" ", "_")
             options = [option.replace("SEEDS", str(seeds)) for option in options]
             lines.append(kill_often(name, options, varying, here, rng, config.n_kills))
-    output_dir.mkdir(parents=True, exist_ok=True)
-    (output_dir / "table.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+            (output_dir / "table.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
     print(*lines, sep="\n")
 
 
