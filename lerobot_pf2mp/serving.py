@@ -17,7 +17,7 @@ from lerobot.policies import make_pre_post_processors
 from lerobot_pf2mp.policies.processor_files import check_processors
 
 
-class GuardedPolicyServer(policy_server.PolicyServer):
+class OneClientPolicyServer(policy_server.PolicyServer):
     """Serves one policy to one client.
 
     LeRobot's server keeps a single policy, queue and clock. A second client would replace the policy of the first one, and
@@ -88,11 +88,11 @@ def serve(config: Any, client_timeout: float) -> None:
 
     Args:
         config: LeRobot's configuration of the server.
-        client_timeout: See `GuardedPolicyServer`.
+        client_timeout: See `OneClientPolicyServer`.
     """
 
-    def make_server(server_config: Any) -> GuardedPolicyServer:
-        return GuardedPolicyServer(server_config, client_timeout)
+    def make_server(server_config: Any) -> OneClientPolicyServer:
+        return OneClientPolicyServer(server_config, client_timeout)
 
     # LeRobot's module makes its server, and loads processors, by these names.
     policy_server.PolicyServer = make_server

@@ -207,6 +207,28 @@ def test_in_memory_training_resumes_in_two_processes(two: tuple[Path, str], fold
     assert differing_keys(*files) == []
 
 
+@pytest.mark.slow
+def test_a_guarded_policy_of_two_processes_has_the_field_of_one_process(folder: Path) -> None:
+    act = ("chunk_size=4", "n_action_steps=4", "dim_model=16", "dim_feedforward=16", "n_heads=2")
+    shared = [
+        "--policy.type=guarded",
+        "--policy.base.type=act",
+        *(f"--policy.base.{option}" for option in act),
+        "--policy.device=cpu",
+        "--policy.push_to_hub=false",
+        "--num_workers=0",
+        "--seed=3",
+        "--steps=12",
+    ]
+    outputs = [folder / "one_guarded", folder / "two_guarded"]
+    run_well("lerobot-train", *options(folder / "umaze", outputs[0]), *shared, "--batch_size=16")
+    in_two_processes("lerobot-train", *options(folder / "umaze", outputs[1]), *shared, "--batch_size=8")
+    files = [next(checkpoint_of(output).glob("*potential_field.safetensors")) for output in outputs]
+    assert differing_keys(*files) == []
+    policy, *_ = load_policy(checkpoint_of(outputs[1]), device="cpu")
+    assert policy.config.type == "guarded"
+
+
 def _gather_in_a_process(rank: int, n_processes: int, folder: Path) -> None:
     store = dist.FileStore(str(folder / "store"), n_processes)
     dist.init_process_group("gloo", store=store, rank=rank, world_size=n_processes)

@@ -14,7 +14,7 @@ from lerobot.async_inference.configs import PolicyServerConfig
 from lerobot.async_inference.helpers import RemotePolicyConfig
 from untrained_policies import ENV, STATE, write_checkpoint
 
-from lerobot_pf2mp.serving import GuardedPolicyServer, load_checked_processors
+from lerobot_pf2mp.serving import OneClientPolicyServer, load_checked_processors
 
 
 class AbortedError(Exception):
@@ -45,14 +45,14 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 
 @pytest.fixture
-def server(monkeypatch: pytest.MonkeyPatch) -> GuardedPolicyServer:
+def server(monkeypatch: pytest.MonkeyPatch) -> OneClientPolicyServer:
     monkeypatch.setattr(
         policy_server, "make_pre_post_processors", load_checked_processors
     )  # as `serve` does it
     monkeypatch.setattr(
         policy_server, "pickle", SimpleNamespace(loads=lambda data: data)
     )  # these tests send none
-    return GuardedPolicyServer(PolicyServerConfig(obs_queue_timeout=0.01), client_timeout=30.0)
+    return OneClientPolicyServer(PolicyServerConfig(obs_queue_timeout=0.01), client_timeout=30.0)
 
 
 def instructions(kind: str, checkpoint: str) -> Any:
@@ -61,7 +61,7 @@ def instructions(kind: str, checkpoint: str) -> Any:
 
 
 def test_a_second_client_is_refused_until_the_first_is_silent(
-    server: GuardedPolicyServer, clock: list[float]
+    server: OneClientPolicyServer, clock: list[float]
 ) -> None:
     server.Ready(None, ROBOT)
     for call in (server.Ready, server.SendPolicyInstructions, server.SendObservations, server.GetActions):
@@ -82,7 +82,7 @@ def test_a_second_client_is_refused_until_the_first_is_silent(
 
 
 def test_a_guarded_policy_is_served_with_its_field(
-    server: GuardedPolicyServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    server: OneClientPolicyServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(policy_server, "SUPPORTED_POLICIES", ["guarded"])
     checkpoint = write_checkpoint(tmp_path / "policy", "guarded")
@@ -100,7 +100,7 @@ def test_a_guarded_policy_is_served_with_its_field(
 
 
 def test_a_served_policy_is_not_replaced(
-    server: GuardedPolicyServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    server: OneClientPolicyServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(policy_server, "SUPPORTED_POLICIES", ["pf2mp"])
     checkpoint = write_checkpoint(tmp_path / "policy", "pf2mp")
@@ -121,7 +121,7 @@ def test_a_served_policy_is_not_replaced(
     ],
 )
 def test_the_client_is_told_what_is_wrong_with_its_checkpoint(
-    kind: str, said: str, server: GuardedPolicyServer, tmp_path: Path
+    kind: str, said: str, server: OneClientPolicyServer, tmp_path: Path
 ) -> None:
     checkpoint = write_checkpoint(tmp_path / "policy", "act")
     path = Path(checkpoint) / "policy_postprocessor.json"
@@ -140,7 +140,7 @@ def test_the_client_is_told_what_is_wrong_with_its_checkpoint(
 
 
 def test_a_policy_opened_without_its_field_is_refused(
-    server: GuardedPolicyServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    server: OneClientPolicyServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(policy_server, "SUPPORTED_POLICIES", ["fmp", "diffusion"])
     server.Ready(None, ROBOT)
