@@ -298,7 +298,7 @@ def test_a_guarded_act_moves_a_simulated_so101_with_lerobots_own_commands(tmp_pa
             "--robot.id=sim",
             f"--robot.calibration_dir={tmp_path / 'calibration'}",
             "--robot.env_id=lerobot_pf2mp/SO101FenceSimulation-v0",
-            "--robot.env_kwargs={image_size: [64, 64]}",
+            "--robot.env_kwargs={image_size: 64}",
             "--robot.seed=0",
             "--robot.cameras={front: {type: sim, source: front, width: 64, height: 64, fps: 20}}",
             "--fps=20",

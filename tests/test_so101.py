@@ -47,7 +47,7 @@ def test_a_scene_in_which_the_arm_cannot_do_the_task_is_refused(changes: dict, m
 
 def test_the_configuration_names_what_lerobots_recorder_would() -> None:
     assert PF2MPSO101Env().features["environment_state"].shape == (5,)
-    config = PF2MPSO101Env(obs_type="pixels_agent_pos", render_size=64)
+    config = PF2MPSO101Env(obs_type="pixels_agent_pos", image_size=64)
     assert config.features["pixels/front"].shape == (64, 64, 3)
     assert config.features_map["pixels/front"] == "observation.images.front"
     with pytest.raises(ConfigError, match="fps must be 20"):
@@ -133,7 +133,12 @@ class TestSimulation:
         assert not np.array_equal(first["environment_state"], other["environment_state"])
 
     def test_the_camera_sees_cube_goal_and_wall(self) -> None:
-        env = gym.make("lerobot_pf2mp/SO101Fence-v0", obs_type="pixels_agent_pos", render_mode="rgb_array")
+        env = gym.make(
+            "lerobot_pf2mp/SO101Fence-v0",
+            obs_type="pixels_agent_pos",
+            render_mode="rgb_array",
+            render_size=96,
+        )
         observation, _ = env.reset(seed=0)
         image = observation["pixels"]["front"].astype(int)
         red, green, blue = np.moveaxis(image, -1, 0)

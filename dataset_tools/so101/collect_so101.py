@@ -62,7 +62,7 @@ def collect_so101(
         )
     dropped: Counter[str] = Counter()
     obs_type = "state" if image_width is None else "pixels_agent_pos"
-    with closing(SO101FenceEnv(obs_type, render_size=image_width or 96)) as env:
+    with closing(SO101FenceEnv(obs_type, image_size=image_width or 96)) as env:
         expert = ScriptedFenceExpert(env, style, seed)
         usable = islice(_usable(map(expert.demonstrate, count()), dropped), n_episodes)
         spec = fence_spec(repo_id, style, seed, image_width)

@@ -24,8 +24,8 @@ _OPEN, _CLOSED = 35.0, 0.0  # of the gripper [percent]
 _ABOVE = (0.055, 0.070)  # height of the tool centre point before it goes down to the cube [m]
 _GRASP_HEIGHT = CUBE_SIZE / 2
 _RELEASE_HEIGHT = _GRASP_HEIGHT + 0.004
-_SETTLED = 1e-5  # of a joint [rad]
-_MAX_ITERATIONS = 100
+_SETTLED = 1e-4  # of a joint [rad]
+_MAX_ITERATIONS = 8  # from the joints of the step before
 # The tool's axes when it points down with the first joint at 0: so101-nexus' convention, z from the wrist to the tips.
 _DOWN = np.diag([-1.0, 1.0, -1.0])
 

@@ -30,8 +30,9 @@ class PF2MPSO101Env(CollisionEnvConfig):
         cube_range: Two opposite corners x, y of the rectangle of the cube's positions [m].
         goal_range: The same for the goal [m].
         terminate_on_success: Whether an episode ends when the cube lies at the goal.
-        render_size: Height and width of the rendered image [pixels].
-        detail: What images show: shapes (those that collisions are computed with, fast) or meshes (0.2 s an image).
+        image_size: Height and width of the observed image [pixels], with obs_type pixels_agent_pos.
+        render_size: Height and width of the images of videos [pixels].
+        detail: What those show: shapes (those that collisions are computed with, fast) or meshes (0.2 s an image).
     """
 
     features_map: dict[str, str] = field(
@@ -50,7 +51,8 @@ class PF2MPSO101Env(CollisionEnvConfig):
     cube_range: tuple[tuple[float, float], tuple[float, float]] | None = None
     goal_range: tuple[tuple[float, float], tuple[float, float]] | None = None
     terminate_on_success: bool = False
-    render_size: int = 96
+    image_size: int = 96
+    render_size: int = 480
     detail: str = "shapes"
 
     def __post_init__(self) -> None:
@@ -65,7 +67,7 @@ class PF2MPSO101Env(CollisionEnvConfig):
             raise ConfigError(f"fps must be {SO101_FPS}, got {self.fps}")
         with reported_on_the_command_line():
             _ = self.scene
-            self._describe(6, 5, lambda: (self.render_size, self.render_size))
+            self._describe(6, 5, lambda: (self.image_size, self.image_size))
         if "pixels" in self.features:
             pixels = self.features.pop("pixels")
             self.features["pixels/front"] = PolicyFeature(FeatureType.VISUAL, pixels.shape)
@@ -83,6 +85,7 @@ class PF2MPSO101Env(CollisionEnvConfig):
             "max_episode_steps": self.episode_length,
             "terminate_on_success": self.terminate_on_success,
             "render_mode": "rgb_array",
+            "image_size": self.image_size,
             "render_size": self.render_size,
             "detail": self.detail,
         }

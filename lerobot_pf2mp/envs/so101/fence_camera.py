@@ -26,11 +26,18 @@ class FenceCamera:
         model: The MuJoCo model.
         detail: One of `DETAILS`.
         image_size: Height and width [pixels].
+
+    Raises:
+        ValueError: If the detail does not exist, or the image is too small.
     """
 
-    def __init__(self, model: mujoco.MjModel, detail: str, image_size: tuple[int, int]) -> None:
+    def __init__(self, model: mujoco.MjModel, detail: str, image_size: int) -> None:
+        if detail not in DETAILS:
+            raise ValueError(f"detail must be one of {list(DETAILS)}, got {detail!r}")
+        if image_size < 32:
+            raise ValueError(f"images must be at least 32 pixels wide, got {image_size}")
         self._model, self._detail = model, detail
-        self.image_size = (int(image_size[0]), int(image_size[1]))
+        self.image_shape = (image_size, image_size, 3)
         self._viewer: OffScreenViewer | None = None
 
     def render(self, data: mujoco.MjData) -> np.ndarray:
@@ -55,7 +62,7 @@ class FenceCamera:
             self._viewer = None
 
     def _make_viewer(self, data: mujoco.MjData) -> OffScreenViewer:
-        height, width = self.image_size
+        height, width, _ = self.image_shape
         # Not MuJoCo's own renderer, because that chooses its OpenGL backend when MuJoCo is imported.
         viewer = OffScreenViewer(self._model, data, width, height)
         viewer.scn.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self._detail == "meshes"

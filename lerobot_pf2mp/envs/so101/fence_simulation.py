@@ -18,7 +18,7 @@ from so101_nexus.objects import CubeObject
 from so101_nexus.scene import MUJOCO_SCENE_OPTION_XML
 
 from lerobot_pf2mp.envs.obstacle import Obstacle
-from lerobot_pf2mp.envs.so101.fence_camera import CAMERA, DETAILS, FenceCamera
+from lerobot_pf2mp.envs.so101.fence_camera import CAMERA, FenceCamera
 from lerobot_pf2mp.envs.so101.fence_scene import (
     CUBE_SIZE,
     GOAL_RADIUS,
@@ -45,9 +45,10 @@ class FenceSimulation(SO101NexusMuJoCoBaseEnv):
         wall_size: Lengths of its sides [m].
         cube_range: Two opposite corners of the rectangle of the cube's positions [m].
         goal_range: The same for the goal [m].
-        image_size: Height and width of the camera's images [pixels].
-        detail: What images show, see `fence_camera.DETAILS`.
         has_camera: Whether observations hold an image.
+        image_size: Height and width of that image [pixels]. It shows shapes, see `fence_camera.DETAILS`.
+        render_size: Height and width of the images of `render` [pixels].
+        detail: What those show.
         render_mode: ``rgb_array`` or None.
         control_mode: so101-nexus' name of what actions are.
 
@@ -61,14 +62,13 @@ class FenceSimulation(SO101NexusMuJoCoBaseEnv):
         wall_size: tuple[float, float, float] | None = None,
         cube_range: Any = None,
         goal_range: Any = None,
-        image_size: tuple[int, int] = (96, 96),
-        detail: str = "shapes",
         has_camera: bool = True,
+        image_size: int = 96,
+        render_size: int = 96,
+        detail: str = "shapes",
         render_mode: str | None = None,
         control_mode: Any = "pd_joint_pos",
     ) -> None:
-        if detail not in DETAILS:
-            raise ValueError(f"detail must be one of {list(DETAILS)}, got {detail!r}")
         self.scene = make_scene(
             wall_position=wall_position, wall_size=wall_size, cube_range=cube_range, goal_range=goal_range
         )
@@ -87,7 +87,8 @@ class FenceSimulation(SO101NexusMuJoCoBaseEnv):
         self.model = copy.deepcopy(compiled)  # each episode changes it
         self.data = mujoco.MjData(self.model)
         self._set_target_geoms(self._cube.geom_ids)
-        self._camera = FenceCamera(self.model, detail, image_size)
+        self._camera = FenceCamera(self.model, "shapes", image_size)
+        self._film_camera = FenceCamera(self.model, detail, render_size)
         self._finish_model_setup()
         robot = self._robot_geoms()
         self.wall = Obstacle(self.model, self.data, "wall", [*robot, *self._cube.geom_ids])
@@ -106,16 +107,17 @@ class FenceSimulation(SO101NexusMuJoCoBaseEnv):
         return self.data.qpos[self._cube.qpos_addr : self._cube.qpos_addr + 3].copy()
 
     def render(self) -> np.ndarray | None:
-        """The camera's image ``(H, W, 3)`` uint8.
+        """An image ``(H, W, 3)`` uint8 for people.
 
         Raises:
             RuntimeError: If this machine cannot render; the message says what to install.
         """
-        return None if self.render_mode is None else self._camera.render(self.data)
+        return None if self.render_mode is None else self._film_camera.render(self.data)
 
     def close(self) -> None:
-        """Frees the renderer."""
+        """Frees the renderers."""
         self._camera.close()
+        self._film_camera.close()
         super().close()
 
     def _bodies(self) -> str:
@@ -161,7 +163,7 @@ class FenceSimulation(SO101NexusMuJoCoBaseEnv):
 
     def _build_observation_space(self) -> spaces.Space:
         joints = spaces.Box(-np.inf, np.inf, (len(self._joint_ids),), np.float32)
-        camera = {CAMERA: spaces.Box(0, 255, (*self._camera.image_size, 3), np.uint8)}
+        camera = {CAMERA: spaces.Box(0, 255, self._camera.image_shape, np.uint8)}
         return spaces.Dict({"state": joints, **(camera if self._has_camera else {})})
 
     def _get_obs(self) -> Any:
