@@ -32,6 +32,7 @@ PACKAGES = (
 EXTRAS = {
     "experts": ("stable-baselines3", DISTRIBUTION, "experts"),
     "async (grpc)": ("grpcio", DISTRIBUTION, "async"),
+    "so101": ("so101-nexus", DISTRIBUTION, "so101"),
     "peft": ("peft", LEROBOT, "peft"),
     "wandb": ("wandb", LEROBOT, "training"),
 }
