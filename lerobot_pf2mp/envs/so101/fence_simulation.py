@@ -87,8 +87,8 @@ class FenceSimulation(SO101NexusMuJoCoBaseEnv):
         self.model = copy.deepcopy(compiled)  # each episode changes it
         self.data = mujoco.MjData(self.model)
         self._set_target_geoms(self._cube.geom_ids)
-        self._camera = FenceCamera(self.model, "shapes", image_size)
-        self._film_camera = FenceCamera(self.model, detail, render_size)
+        self._camera = FenceCamera(self.model, CAMERA, "shapes", image_size)
+        self._film_camera = FenceCamera(self.model, "side", detail, render_size)
         self._finish_model_setup()
         robot = self._robot_geoms()
         self.wall = Obstacle(self.model, self.data, "wall", [*robot, *self._cube.geom_ids])
