@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +33,11 @@ def convert_handwriting(
     n_steps: int,
     scene_options: dict[str, Any],
     joint_offsets: Sequence[float] = (),
-    scale: float = 1.0,
+    scale: float | None = None,
     place: Sequence[float] | None = None,
+    strokes: str = "one",
+    character: str | None = None,
+    tell: Callable[[str], None] = lambda line: None,
     n_episodes: int | None = None,
     overwrite: bool = False,
 ) -> tuple[int, Counter[str]]:
@@ -51,8 +54,11 @@ def convert_handwriting(
         n_steps: Steps T that each episode is resampled to.
         scene_options: Arguments of `make_writing_scene`; its regions must not be entered.
         joint_offsets: As for `RecordingFrame`.
-        scale: As for `RecordingFrame`.
-        place: As for `RecordingFrame`.
+        scale: As for `read_handwriting`.
+        place: As for `read_handwriting`.
+        strokes: As for `StrokeChoice`.
+        character: As for `read_recording`.
+        tell: As for `read_handwriting`.
         n_episodes: Largest number of episodes to write; None writes all.
         overwrite: Whether an existing dataset is replaced.
 
@@ -68,7 +74,16 @@ def convert_handwriting(
     check_n_steps(n_steps)
     env = HandwritingEnv("joint", control="exact", **scene_options)
     left_out: Counter[str] = Counter()
-    recordings = read_handwriting(path, joint_offsets, scale=scale, place=place, left_out=left_out)
+    recordings = read_handwriting(
+        path,
+        joint_offsets,
+        scale=scale,
+        place=place,
+        strokes=strokes,
+        character=character,
+        left_out=left_out,
+        tell=tell,
+    )
     _check_frames(n_steps, len(recordings) if n_episodes is None else min(n_episodes, len(recordings)))
     n_written, dropped = write_trajectories(
         _usable(path, recordings, env, space, n_steps, left_out),

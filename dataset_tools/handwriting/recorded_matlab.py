@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reads recorded handwriting from MATLAB files: LASA's shapes, and the symbols of the Panda co-manipulation dataset.
+
+| variable | holds, for each demonstration | unit |
+|---|---|---|
+| ``demos`` (LASA) | a struct with ``pos`` (2, T) and ``t`` (1, T) | millimetres, seconds |
+| ``symbol_data`` (Panda symbols) | a struct with ``pos`` (3, T), the arm's end effector, 1000 samples a second | metres |
+
+Velocities, accelerations and forces are not needed. A third coordinate is a height; the lowest point is on the table.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.io import loadmat, whosmat
+
+from lerobot_pf2mp.dataset_tools.array_size import check_size
+from lerobot_pf2mp.dataset_tools.handwriting.matlab_size import unpacked_size
+from lerobot_pf2mp.dataset_tools.handwriting.recorded_episode import RecordedEpisode, Recording
+from lerobot_pf2mp.errors import explained
+
+_UNITS = {
+    "demos": (0.001, "millimetres, as in LASA's files"),
+    "symbol_data": (1.0, "metres, as in the Panda symbols"),
+}
+_RATE = 1000.0  # of the Panda symbols [Hz]
+_POINTER = 8  # bytes that a file needs at least for an element of a cell or struct
+
+
+def read_matlab(path: Path) -> Recording:
+    """Reads the demonstrations of a MATLAB file, version 7 or before. Nothing in it is executed.
+
+    Raises:
+        ValueError: If it is damaged, has another layout, or claims to hold much more than is stored.
+    """
+    n_bytes = unpacked_size(path)
+    with explained(f"{path} must be a whole MATLAB file"):
+        shapes = {name: shape for name, shape, _ in whosmat(path)}
+    found = [name for name in _UNITS if name in shapes]
+    if len(found) != 1:
+        raise ValueError(
+            f"{path} must hold one of the variables {', '.join(_UNITS)}: LASA's demos with pos and t, or the Panda symbols' "
+            f"symbol_data with pos; got {', '.join(shapes) or 'none'}"
+        )
+    (variable,) = found
+    shape = shapes[variable]
+    check_size(variable, shape, _POINTER * math.prod(shape), n_bytes, path)
+    with explained(f"{path} must be a whole MATLAB file"):
+        content = loadmat(path, variable_names=[variable], simplify_cells=True)[variable]
+    demonstrations = [content] if isinstance(content, dict) else list(np.atleast_1d(content))
+    scale, unit = _UNITS[variable]
+    episodes = [_episode(each, f"{variable} {number}", path) for number, each in enumerate(demonstrations, 1)]
+    return Recording(episodes, scale, unit, is_of_another_sheet=True)
+
+
+def _episode(content: Any, name: str, path: Path) -> RecordedEpisode:
+    if not isinstance(content, dict) or "pos" not in content:
+        got = list(content) if isinstance(content, dict) else type(content).__name__
+        raise ValueError(f"{name} of {path} must be a struct with pos, got {got}")
+    positions = _numbers(content["pos"], f"pos in {name} of {path}")
+    if positions.ndim != 2 or len(positions) not in (2, 3):
+        raise ValueError(
+            f"pos in {name} of {path} must have 2 or 3 rows, x, y and z, got an array of shape {positions.shape}"
+        )
+    n_samples = positions.shape[1]
+    times = np.arange(n_samples) / _RATE
+    if "t" in content:
+        times = np.atleast_1d(_numbers(content["t"], f"t in {name} of {path}"))
+    if times.shape != (n_samples,):
+        raise ValueError(
+            f"t in {name} of {path} must hold the time of each of {n_samples} positions, got an array of shape {times.shape}"
+        )
+    heights = positions[2] - positions[2].min() if len(positions) == 3 and n_samples else None
+    return RecordedEpisode(name, times, positions[:2].T, heights)
+
+
+def _numbers(content: Any, name: str) -> np.ndarray:
+    array = np.asarray(content)
+    if array.dtype.kind not in "iufb":
+        raise ValueError(f"{name} must hold real numbers, got {type(content).__name__} of {array.dtype}")
+    return array.astype(np.float64)
