@@ -274,7 +274,7 @@ def test_millimetres_of_another_sheet_become_metres_in_the_frame_of_the_arm(tmp_
     [
         ({"scale": 0.0}, "scale must be a finite length above 0 m, got 0.0"),
         ({"scale": np.nan}, "scale must be a finite length above 0 m, got nan"),
-        ({"scale": None}, "scale must be a finite length above 0 m, got None"),
+        ({"scale": -0.001}, "scale must be a finite length above 0 m, got -0.001"),
         ({"place": [0.5]}, r"place must be two finite positions x, y \[m\], got \[0.5\]"),
         ({"place": [0.5, None]}, r"place must be two finite positions x, y \[m\], got \[0.5, None\]"),
         (

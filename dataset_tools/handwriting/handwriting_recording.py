@@ -137,14 +137,22 @@ def read_handwriting(
         )
     if place is None and recorded.is_of_another_sheet:
         frame = frame.centred(np.concatenate([each.values for each in recordings]))
-        tell(f"{path} is put in the middle of the sheet: --source.place={list(frame.place or ())}".replace(", ", ","))
+        tell(
+            f"{path} is put in the middle of the sheet: --source.place={list(frame.place or ())}".replace(
+                ", ", ","
+            )
+        )
     if left_out is not None:
         left_out.update(fault.reason for fault in faults)
     return [_in_frame(each, frame) for each in recordings]
 
 
 def _read(
-    recorded: Recording, frame: RecordingFrame, choice: StrokeChoice, path: Path, found: list[HandwritingRecording]
+    recorded: Recording,
+    frame: RecordingFrame,
+    choice: StrokeChoice,
+    path: Path,
+    found: list[HandwritingRecording],
 ) -> Iterator[LeftOutError]:
     """Appends the chosen strokes to those found, in the unit of the recording; yields why others are left out."""
     for episode in recorded.episodes:

@@ -37,7 +37,9 @@ def episodes_of_json(content: Any, path: Path) -> list[RecordedEpisode]:
         ValueError: If it has another layout.
     """
     if not isinstance(content, dict) or not isinstance(content.get("episodes"), list):
-        raise ValueError(f'{path} must hold {{"episodes": [...]}}, or {{"data": {{"x": [...], ...}}}} of a tablet')
+        raise ValueError(
+            f'{path} must hold {{"episodes": [...]}}, or {{"data": {{"x": [...], ...}}}} of a tablet'
+        )
     return [_episode(each, number, path) for number, each in enumerate(content["episodes"])]
 
 

@@ -61,8 +61,8 @@ class StrokeChoice:
         if len(found) > 1:
             raise LeftOutError(
                 "with the pen lifted in between",
-                f"a demonstration must be one stroke, got the pen lifted in row {found[0].stop} of {name} and put down again "
-                f"({len(found)} strokes: --source.strokes=each makes each a demonstration, a number takes that one)",
+                f"a demonstration must be one stroke, got the pen lifted in row {found[0].stop} of {name} and put down "
+                f"again ({len(found)} strokes: --source.strokes=each makes each a demonstration, a number takes that one)",
             )
         return [(name, found[0])]
 

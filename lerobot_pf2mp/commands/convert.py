@@ -83,10 +83,10 @@ class ConvertConfig(WritingConfig):
     line. Of a LeRobotDataset the actions are used, by their names: 7 joints, or 7 joints and 2 fingers.
 
     Recordings of others, from a sheet of their own: SVC and JSON files of the package handwriting-sample (x, y, time, pen
-    status, ...; millimetres, or whole numbers for counts of the tablet, 5080 or "lpi" in an inch). MATLAB files up to version
-    7 with LASA's demos (pos and t; millimetres) or the Panda symbols' symbol_data (pos; metres, 1 kHz). Omniglot's strokes
-    (x, y, time between START and BREAK; 105 pixels become 0.18 m). Unit and place are printed as the options that say the
-    same. x points away from the arm there too, so that a page is written with its right side ahead.
+    status, ...; millimetres, or whole numbers for counts of the tablet, 5080 or "lpi" in an inch). MATLAB files of version 5
+    to 7 with LASA's demos (pos and t; millimetres) or the Panda symbols' symbol_data (pos; metres, 1 kHz). Omniglot's
+    strokes (x, y, time between START and BREAK; 105 pixels become 0.18 m). Unit and place are printed as the options that
+    say the same. x points away from the arm there too, so that a page is written with its right side ahead.
 
     A demonstration of handwriting is one stroke. Columns pen_down, pen_up, pressure or z (height of the pen above the table)
     tell where the pen is lifted: what comes before the stroke and after it is left out, and so are episodes in which the pen
