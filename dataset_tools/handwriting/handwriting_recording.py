@@ -131,9 +131,8 @@ def read_handwriting(
     recordings: list[HandwritingRecording] = []
     faults = list(_read(recorded, frame, choice, path, recordings))
     if not recordings:
-        reason = f": {faults[0]}" if faults else ""
         raise ValueError(
-            f"{path} must hold at least one episode, got none{' that is usable' if faults else ''}{reason}"
+            f"{path} must hold at least one episode, got none{' that is usable' if faults else ''}{_why(faults)}"
         )
     if place is None and recorded.is_of_another_sheet:
         frame = frame.centred(np.concatenate([each.values for each in recordings]))
@@ -145,6 +144,14 @@ def read_handwriting(
     if left_out is not None:
         left_out.update(fault.reason for fault in faults)
     return [_in_frame(each, frame) for each in recordings]
+
+
+def _why(faults: Sequence[LeftOutError]) -> str:
+    """What is wrong with the first episode, and if there are several, how many are left out for which reason."""
+    if len(faults) < 2:
+        return f": {faults[0]}" if faults else ""
+    reasons = Counter(fault.reason for fault in faults)
+    return f" ({', '.join(f'{number} {reason}' for reason, number in reasons.items())}): {faults[0]}"
 
 
 def _read(

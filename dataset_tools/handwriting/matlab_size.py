@@ -32,9 +32,11 @@ def unpacked_size(path: Path) -> int:
         order = {b"IM": "<", b"MI": ">"}.get(header[126:])
         if order is None:
             raise ValueError(f"{path} must be a MATLAB file of version 5 to 7, got another file")
-        while len(tag := file.read(_TAG)) == _TAG:
-            kind, n_bytes = struct.unpack(f"{order}II", tag)
+        while tag := file.read(_TAG):
+            kind, n_bytes = struct.unpack(f"{order}II", tag.ljust(_TAG, b"\0"))
             content = file.read(n_bytes)
+            if len(tag) < _TAG or len(content) < n_bytes:
+                raise ValueError(f"{path} must be a whole MATLAB file, got one that is cut off")
             total += _inflated(content, path) if kind == _COMPRESSED else len(content)
     return total
 
