@@ -13,7 +13,7 @@ import re
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 
@@ -26,6 +26,7 @@ _SIDE = 105  # of Omniglot's sheet [pixels]
 _UNIT = f"pixels, of which {_SIDE} become {LETTER_HEIGHT:g} m, the height of a letter"
 _MANY = 12  # names in a message
 
+_Name = tuple[str, ...]  # the folders above a drawing, and its file
 _Read = Callable[[], bytes]
 
 
@@ -52,14 +53,14 @@ def is_omniglot_folder(path: Path) -> bool:
 
 
 @contextmanager
-def _contents(path: Path) -> Iterator[dict[PurePosixPath, _Read]]:
+def _contents(path: Path) -> Iterator[dict[_Name, _Read]]:
     """The drawings by name, and how each is read."""
     if path.is_dir():
         files = sorted(file for file in path.rglob("*.txt") if _DRAWING.fullmatch(file.name))
         # The folder may be an alphabet or a character: the names above a drawing are those of the path.
-        yield {PurePosixPath(file.absolute().as_posix()): file.read_bytes for file in files}
+        yield {file.absolute().parts: file.read_bytes for file in files}
     elif path.suffix.lower() == ".txt":
-        yield {PurePosixPath(path.absolute().as_posix()): path.read_bytes}
+        yield {path.absolute().parts: path.read_bytes}
     else:
         try:
             archive = zipfile.ZipFile(path)
@@ -69,10 +70,10 @@ def _contents(path: Path) -> Iterator[dict[PurePosixPath, _Read]]:
             yield {name: _reader(archive, info, path) for name, info in _drawings_in(archive)}
 
 
-def _drawings_in(archive: zipfile.ZipFile) -> Iterator[tuple[PurePosixPath, zipfile.ZipInfo]]:
+def _drawings_in(archive: zipfile.ZipFile) -> Iterator[tuple[_Name, zipfile.ZipInfo]]:
     for info in sorted(archive.infolist(), key=lambda info: info.filename):
-        name = PurePosixPath(info.filename)
-        if _DRAWING.fullmatch(name.name) and "__MACOSX" not in name.parts:
+        name = tuple(info.filename.split("/"))
+        if _DRAWING.fullmatch(name[-1]) and "__MACOSX" not in name:
             yield name, info
 
 
@@ -87,22 +88,20 @@ def _reader(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path) -> _Rea
     return read
 
 
-def _of_character(
-    drawings: dict[PurePosixPath, _Read], character: str | None, path: Path
-) -> list[PurePosixPath]:
+def _of_character(drawings: dict[_Name, _Read], character: str | None, path: Path) -> list[_Name]:
     """The drawings of the chosen character."""
     if not drawings:
         raise ValueError(f"{path} must hold drawings of Omniglot, NNNN_NN.txt, got none")
-    wanted = PurePosixPath(character or "").parts
-    fitting = [name for name in drawings if name.parent.parts[-len(wanted) :] == wanted or not wanted]
-    characters = sorted({"/".join(name.parent.parts[-2:]) for name in fitting})
+    wanted = tuple(character.strip("/").split("/")) if character else ()
+    fitting = [name for name in drawings if not wanted or name[:-1][-len(wanted) :] == wanted]
+    characters = {"/".join(name[-3:-1]) for name in fitting}
     if not fitting:
-        choices = {"/".join(name.parent.parts[-2:]) for name in drawings}
+        choices = {"/".join(name[-3:-1]) for name in drawings}
         raise ValueError(
             f"--source.character must be one of those in {path}: {_listed(choices)}; got {character!r}"
         )
     if len(characters) > 1:
-        raise ValueError(f"--source.character must name one of those in {path}: {_listed(set(characters))}")
+        raise ValueError(f"--source.character must name one of those in {path}: {_listed(characters)}")
     return fitting
 
 
@@ -110,18 +109,16 @@ def _listed(characters: set[str]) -> str:
     """Names of characters; with many, how many there are of each alphabet."""
     if len(characters) <= _MANY:
         return ", ".join(sorted(characters))
-    alphabets = sorted({name.rpartition("/")[0] for name in characters})
-    return ", ".join(
-        f"{alphabet}/{sorted(mine)[0]} to {sorted(mine)[-1]}"
-        for alphabet in alphabets
-        if (mine := {name.rpartition("/")[2] for name in characters if name.rpartition("/")[0] == alphabet})
-    )
+    of_alphabet: dict[str, list[str]] = {}
+    for alphabet, _, character in sorted(name.rpartition("/") for name in characters):
+        of_alphabet.setdefault(alphabet, []).append(character)
+    return ", ".join(f"{alphabet}/{mine[0]} to {mine[-1]}" for alphabet, mine in of_alphabet.items())
 
 
-def _episode(name: PurePosixPath, content: bytes, path: Path) -> RecordedEpisode:
+def _episode(name: _Name, content: bytes, path: Path) -> RecordedEpisode:
     rows: list[list[float]] = []
     breaks: list[int] = []
-    title = f"drawing {name.stem}"
+    title = f"drawing {name[-1].removesuffix('.txt')}"
     lines = content.decode("utf-8", errors="replace").splitlines()
     if not lines or lines[0].strip() != "START":
         got = f"{lines[0]!r:.40}" if lines else "an empty file"
