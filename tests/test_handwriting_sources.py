@@ -2,6 +2,7 @@
 """Recordings of handwriting as tablets, robots and spreadsheets leave them."""
 
 import json
+import re
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -297,11 +298,12 @@ def test_units_and_places_of_the_pen_are_refused_for_joints(tmp_path: Path, opti
 
 def test_positions_off_the_sheet_are_refused_naming_the_row(tmp_path: Path) -> None:
     places = STRAIGHT.copy()
-    places[4, 1] = 0.3
-    path = written(tmp_path / "a.csv", text(["time", "x", "y"], [TIMES, *places.T]))
+    places[4, 1] = 0.2
     options = {"root": tmp_path / "d", "repo_id": "a/b", "n_steps": 5, "scene_options": {}}
-    with pytest.raises(ValueError, match=r"must lie on the sheet, .* got \[.*, 0.3\] in row 4"):
-        convert_handwriting(path, "pen", **options)
+    for scale, message in ((1, "0.2] in row 4; --source.place moves"), (1000, "larger than the sheet; mill")):
+        path = written(tmp_path / "a.csv", text(["time", "x", "y"], [TIMES, *(places * scale).T]))
+        with pytest.raises(ValueError, match=f"must lie on the sheet, .* got .*{re.escape(message)}"):
+            convert_handwriting(path, "pen", **options)
 
 
 # Datasets of LeRobot

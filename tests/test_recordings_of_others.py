@@ -3,6 +3,7 @@
 
 import json
 import struct
+import sys
 import zipfile
 import zlib
 from collections import Counter
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 import scipy.io
 
+from lerobot_pf2mp.commands import cli
 from lerobot_pf2mp.dataset_tools.handwriting.handwriting_recording import (
     HandwritingRecording,
     read_handwriting,
@@ -395,3 +397,79 @@ def test_matlab_files_that_are_damaged_or_too_new_are_refused(
     path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(ValueError, match=message):
         read_handwriting(path)
+
+
+# pf2mp-convert
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("make", "options", "what", "n_written"),
+    [
+        (lambda folder: svc(folder, svc_text([WAY + 0.5], [DOWN])), [], "millimetres, because not all", 1),
+        (
+            lambda folder: svc(folder, svc_text([WAY, WAY, WAY + 0.5], [DOWN, UP, DOWN])),
+            ["--source.strokes=each"],
+            "millimetres, because not all",
+            2,
+        ),
+        (
+            lambda folder: omniglot(folder, _0395_01=drawing(WAY), _0395_02=drawing(WAY)),
+            ["--source.character=Greek/character02"],
+            "pixels, of which 105 become 0.18 m",
+            2,
+        ),
+        (lambda folder: lasa(folder, demo(), demo(), demo()), [], "millimetres, as in LASA's files", 3),
+        (
+            lambda folder: panda_symbols(folder, WAY / 1000),
+            ["--source.place=[0.45,0]", "--source.scale=2"],
+            "",
+            1,
+        ),
+    ],
+)
+def test_the_command_converts_recordings_of_others_and_says_their_unit(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    make: Callable[[Path], Path],
+    options: list[str],
+    what: str,
+    n_written: int,
+) -> None:
+    usual = ["--source.type=handwriting", "--task=handwriting_pen", "--n_regions=0", "--n_steps=5"]
+    own = [f"--source.path={make(tmp_path)}", f"--root={tmp_path / 'd'}"]
+    monkeypatch.setattr(sys, "argv", ["pf2mp-convert", *usual, *own, *options])
+    cli.convert()
+    *told, last = capfd.readouterr().out.strip().splitlines()
+    assert last.startswith(f"Wrote {n_written} episodes of 5 steps to {tmp_path / 'd'} ")
+    assert len(told) == (2 if what else 0)
+    assert what in (told or [""])[0]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--source.strokes=all"], "error: strokes must be one, each or a number from 1 on, got 'all'"),
+        (["--source.scale=0"], "error: scale must be a finite length above 0 m, got 0.0"),
+        (["--source.character=a/b"], "error: --source.character is for Omniglot's drawings, got another"),
+        (["--source.path=drawing.mat"], "error: drawing.mat must be a MATLAB file of version 5 to 7"),
+        (["--source.scale=0.1"], "error: the pen in the drawing of drawing.svc must lie on the sheet"),
+    ],
+)
+def test_bad_options_for_recordings_of_others_end_in_one_line_and_nothing_written(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    options: list[str],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    svc(Path(), svc_text([WAY + 0.5], [DOWN]))
+    Path("drawing.mat").write_bytes(b"text")
+    usual = ["--source.type=handwriting", "--source.path=drawing.svc", "--task=handwriting_pen", "--root=d"]
+    monkeypatch.setattr(sys, "argv", ["pf2mp-convert", *usual, "--n_regions=0", *options])
+    with pytest.raises(SystemExit, match="1"):
+        cli.convert()
+    assert capfd.readouterr().err.strip().splitlines()[-1].startswith(message)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["drawing.mat", "drawing.svc"]

@@ -19,6 +19,7 @@ from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory, check_n_ste
 from lerobot_pf2mp.dataset_tools.writing.write_trajectories import write_trajectories
 from lerobot_pf2mp.envs.handwriting.handwriting_env import HandwritingEnv
 from lerobot_pf2mp.envs.handwriting.ink import INK_HEIGHT
+from lerobot_pf2mp.envs.handwriting.sheet import SHEET_SIDE
 from lerobot_pf2mp.envs.handwriting.writing_scene import check_on_sheet
 
 _MOST_FRAMES = 10**6
@@ -141,13 +142,24 @@ def _trajectories(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Joint positions ``(T + 1, 9)`` [rad; m], and positions ``(T + 1, 2)`` and heights ``(T + 1,)`` of the pen [m]."""
     if recording.values.shape[1] == 2:
-        check_on_sheet(recording.values, f"the pen in {recording.name}")
+        _check_pen(recording)
         positions = recording.resampled(n_steps)
         return env.kinematics.joint_trajectory(positions), positions, np.zeros(n_steps + 1)
     env.check_joints(recording.values, f"the joints in {recording.name}")
     joints = recording.resampled(n_steps)
     tips = env.kinematics.tips(joints)
     return joints, tips[:, :2], tips[:, 2]
+
+
+def _check_pen(recording: HandwritingRecording) -> None:
+    """Refuses a recorded pen that leaves the sheet, and names the option that may help."""
+    try:
+        check_on_sheet(recording.values, f"the pen in {recording.name}")
+    except ValueError as error:
+        is_too_large = np.ptp(recording.values, axis=0).max() > SHEET_SIDE
+        too_large = "larger than the sheet; millimetres need --source.scale=0.001"
+        hint = f"it is {too_large}" if is_too_large else "--source.place moves the recording"
+        raise ValueError(f"{error}; {hint}") from error
 
 
 def _collides(env: HandwritingEnv, joints: np.ndarray) -> bool:
