@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.io
+import scipy.sparse
 
 from lerobot_pf2mp.commands import cli
 from lerobot_pf2mp.dataset_tools.handwriting.handwriting_recording import (
@@ -334,24 +335,32 @@ def test_symbols_of_the_panda_are_metres_and_the_pen_is_lifted_by_its_height(tmp
     np.testing.assert_array_equal(second.values, first.values[2:])
 
 
+@pytest.mark.parametrize("kind", ["i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8"])
+def test_numbers_of_matlab_files_may_have_any_type(tmp_path: Path, kind: str) -> None:
+    path = lasa(tmp_path, {**demo(), "pos": WAY.T.astype(kind)})
+    (recording,) = read_handwriting(path, place=[0.0, 0.0])
+    np.testing.assert_allclose(recording.values, WAY / 1000)
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
         ({"other": [1.0]}, "must hold one of the variables demos, symbol_data: LASA's demos .*; got other"),
-        ({}, r"symbol_data with pos; got none"),
-        ({"demos": [1.0, 2.0]}, "demos 1 of .*a.mat must be a struct with pos, got float"),
-        ({"demos": {"vel": [1.0]}}, r"demos 1 of .*a.mat must be a struct with pos, got \['vel'\]"),
-        ({"demos": {"pos": "text"}}, "pos in demos 1 of .* must hold real numbers, got str of <U4"),
+        ({}, "symbol_data with pos; got none"),
+        ({"demos": [1.0, 2.0]}, "demos in .*a.mat must be a cell or a struct, got an array of numbers"),
+        ({"demos": "text"}, "demos in .*a.mat must be a cell or a struct, got text"),
+        ({"demos": np.array([1.0, "a"], dtype=object)}, "demos 1 of .* with pos, got an array of numbers"),
+        ({"demos": {"vel": [1.0]}}, "demos 1 of .*a.mat must be a struct with pos, got vel"),
+        ({"demos": {"pos": "text"}}, "pos in demos 1 of .* must hold real numbers, got text"),
+        ({"demos": {"pos": WAY.T * 1j}}, "pos in demos 1 of .* must hold real numbers, got complex numbers"),
+        ({"demos": {"pos": scipy.sparse.eye(2)}}, "pos in demos 1 of .* real numbers, got a sparse matrix"),
         (
-            {"demos": {"pos": WAY.T * 1j}},
-            "pos in demos 1 of .* must hold real numbers, got ndarray of complex",
+            {"demos": {"pos": {"x": 1.0}}},
+            "pos in demos 1 of .* must hold real numbers, got a cell or a struct",
         ),
         ({"demos": {"pos": np.zeros((4, 6))}}, r"must have 2 or 3 rows, x, y and z, got .* shape \(4, 6\)"),
-        ({"demos": {"pos": WAY.T, "t": [0.0, 1.0]}}, r"hold the time of each of 6 positions, got .* \(2,\)"),
-        (
-            {"symbol_data": {"pos": np.zeros((3, 0))}},
-            r"have 2 or 3 rows, x, y and z, got .* shape \(0,\)",
-        ),
+        ({"demos": {"pos": WAY.T, "t": [0.0, 1.0]}}, r"hold the time of each of 6 positions, .* \(1, 2\)"),
+        ({"symbol_data": {"pos": np.zeros((3, 0))}}, "none that is usable: symbol_data 1 .* at least 3 samp"),
     ],
 )
 def test_matlab_files_of_another_layout_are_refused(
@@ -385,7 +394,7 @@ def bomb(content: bytes) -> bytes:
     [
         (lambda _: b"text", "Line.mat must be a MATLAB file of version 5 to 7, got another file"),
         (of_version_7_3, "must be a MATLAB file of version 7 or before, got one of 7.3: save it with -v7"),
-        (cut_off, "Line.mat must be a whole MATLAB file, got one that is cut off"),
+        (cut_off, "Line.mat must be a whole MATLAB file: an element is cut off"),
         (scrambled, "Line.mat must be a whole MATLAB file"),
         (bomb, "a variable must be stored in the file, got an array of shape"),
     ],
@@ -397,6 +406,23 @@ def test_matlab_files_that_are_damaged_or_too_new_are_refused(
     path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(ValueError, match=message):
         read_handwriting(path)
+
+
+@pytest.mark.parametrize("is_compressed", [True, False])
+def test_matlab_files_with_a_wrong_byte_anywhere_are_read_or_refused(
+    tmp_path: Path, is_compressed: bool
+) -> None:
+    whole = lasa(tmp_path, demo(), do_compression=is_compressed).read_bytes()
+    path, n_refused = tmp_path / "a.mat", 0
+    for at in range(126, len(whole), 3):
+        for byte in (0, 255, whole[at] ^ 1):
+            path.write_bytes(whole[:at] + bytes([byte]) + whole[at + 1 :])
+            try:
+                read_handwriting(path)
+            except ValueError as error:
+                n_refused += 1
+                assert str(path) in str(error)
+    assert n_refused > 100
 
 
 # pf2mp-convert

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.io
 
 from lerobot_pf2mp.dataset_tools.handwriting.convert_handwriting import convert_handwriting
 from lerobot_pf2mp.dataset_tools.handwriting.handwriting_recording import read_handwriting
+from lerobot_pf2mp.dataset_tools.handwriting.matlab_file import read_matlab_variables
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 TABLET, PANDA, OMNIGLOT = (
@@ -36,6 +38,14 @@ def test_the_first_hundred_samples_of_the_tablet_s_json_are_one_stroke() -> None
     (stroke,) = read_handwriting(TABLET / "signal.json", scale=0.001, place=[0.4, 0.0])
     np.testing.assert_allclose(stroke.values[0], [0.45281, 0.05281])
     assert len(stroke.times) == 100
+
+
+def test_the_recordings_of_the_panda_are_those_that_scipy_reads() -> None:
+    theirs = scipy.io.loadmat(PANDA, simplify_cells=True)["symbol_data"]
+    _, ours = read_matlab_variables(PANDA, ["symbol_data"])
+    for one, other in zip(ours["symbol_data"], theirs, strict=True):
+        for field in ("pos", "vel", "F"):
+            np.testing.assert_array_equal(one[field], other[field])
 
 
 def test_the_recordings_of_the_panda_become_a_dataset(tmp_path: Path) -> None:

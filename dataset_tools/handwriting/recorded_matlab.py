@@ -11,24 +11,19 @@ Velocities, accelerations and forces are not needed. A third coordinate is a hei
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.io import loadmat, whosmat
 
-from lerobot_pf2mp.dataset_tools.array_size import check_size
-from lerobot_pf2mp.dataset_tools.handwriting.matlab_size import unpacked_size
+from lerobot_pf2mp.dataset_tools.handwriting.matlab_file import Unread, read_matlab_variables
 from lerobot_pf2mp.dataset_tools.handwriting.recorded_episode import RecordedEpisode, Recording
-from lerobot_pf2mp.errors import explained
 
 _UNITS = {
     "demos": (0.001, "millimetres, as in LASA's files"),
     "symbol_data": (1.0, "metres, as in the Panda symbols"),
 }
 _RATE = 1000.0  # of the Panda symbols [Hz]
-_POINTER = 8  # bytes that a file needs at least for an element of a cell or struct
 
 
 def read_matlab(path: Path) -> Recording:
@@ -37,21 +32,16 @@ def read_matlab(path: Path) -> Recording:
     Raises:
         ValueError: If it is damaged, has another layout, or claims to hold much more than is stored.
     """
-    n_bytes = unpacked_size(path)
-    with explained(f"{path} must be a whole MATLAB file"):
-        shapes = {name: shape for name, shape, _ in whosmat(path)}
-    found = [name for name in _UNITS if name in shapes]
-    if len(found) != 1:
+    names, values = read_matlab_variables(path, list(_UNITS))
+    if len(values) != 1:
         raise ValueError(
             f"{path} must hold one of the variables {', '.join(_UNITS)}: LASA's demos with pos and t, or the Panda symbols' "
-            f"symbol_data with pos; got {', '.join(shapes) or 'none'}"
+            f"symbol_data with pos; got {', '.join(names) or 'none'}"
         )
-    (variable,) = found
-    shape = shapes[variable]
-    check_size(variable, shape, _POINTER * math.prod(shape), n_bytes, path)
-    with explained(f"{path} must be a whole MATLAB file"):
-        content = loadmat(path, variable_names=[variable], simplify_cells=True)[variable]
-    demonstrations = [content] if isinstance(content, dict) else list(np.atleast_1d(content))
+    ((variable, content),) = values.items()
+    if not isinstance(content, list):
+        raise ValueError(f"{variable} in {path} must be a cell or a struct, got {_kind(content)}")
+    demonstrations = [each[0] if isinstance(each, list) and len(each) == 1 else each for each in content]
     scale, unit = _UNITS[variable]
     episodes = [_episode(each, f"{variable} {number}", path) for number, each in enumerate(demonstrations, 1)]
     return Recording(episodes, scale, unit, is_of_another_sheet=True)
@@ -59,7 +49,7 @@ def read_matlab(path: Path) -> Recording:
 
 def _episode(content: Any, name: str, path: Path) -> RecordedEpisode:
     if not isinstance(content, dict) or "pos" not in content:
-        got = list(content) if isinstance(content, dict) else type(content).__name__
+        got = ", ".join(content) if isinstance(content, dict) else _kind(content)
         raise ValueError(f"{name} of {path} must be a struct with pos, got {got}")
     positions = _numbers(content["pos"], f"pos in {name} of {path}")
     if positions.ndim != 2 or len(positions) not in (2, 3):
@@ -69,17 +59,24 @@ def _episode(content: Any, name: str, path: Path) -> RecordedEpisode:
     n_samples = positions.shape[1]
     times = np.arange(n_samples) / _RATE
     if "t" in content:
-        times = np.atleast_1d(_numbers(content["t"], f"t in {name} of {path}"))
-    if times.shape != (n_samples,):
-        raise ValueError(
-            f"t in {name} of {path} must hold the time of each of {n_samples} positions, got an array of shape {times.shape}"
-        )
+        times = _numbers(content["t"], f"t in {name} of {path}")
+        if times.size != n_samples or times.ndim != 2 or 1 not in times.shape:
+            raise ValueError(
+                f"t in {name} of {path} must hold the time of each of {n_samples} positions, got an array of shape "
+                f"{times.shape}"
+            )
     heights = positions[2] - positions[2].min() if len(positions) == 3 and n_samples else None
-    return RecordedEpisode(name, times, positions[:2].T, heights)
+    return RecordedEpisode(name, times.ravel(), positions[:2].T, heights)
 
 
 def _numbers(content: Any, name: str) -> np.ndarray:
-    array = np.asarray(content)
-    if array.dtype.kind not in "iufb":
-        raise ValueError(f"{name} must hold real numbers, got {type(content).__name__} of {array.dtype}")
-    return array.astype(np.float64)
+    if not isinstance(content, np.ndarray):
+        raise ValueError(f"{name} must hold real numbers, got {_kind(content)}")
+    return content
+
+
+def _kind(content: Any) -> str:
+    """What a value is, for error messages."""
+    if isinstance(content, np.ndarray):
+        return "an array of numbers"
+    return str(content) if isinstance(content, Unread) else "a cell or a struct of another shape"
