@@ -158,4 +158,4 @@ def _nested(parts: Iterator[tuple[int, memoryview]], order: str, depth: int) -> 
 def _numbers(kind: int, data: memoryview, order: str) -> np.ndarray:
     if kind not in _NUMBERS:
         raise ValueError(f"numbers must be of a known kind, got kind {kind}")
-    return np.frombuffer(data, dtype=np.dtype(_NUMBERS[kind]).newbyteorder(order))
+    return np.frombuffer(data, dtype=np.dtype(f"{order}{_NUMBERS[kind]}"))
