@@ -271,6 +271,30 @@ def test_millimetres_of_another_sheet_become_metres_in_the_frame_of_the_arm(tmp_
 
 
 @pytest.mark.parametrize(
+    ("names", "scale", "told"),
+    [
+        ("x [mm],y [mm]", 0.001, "millimetres, as its columns say: --source.scale=0.001"),
+        ("X (CM),pos_y (cm)", 0.01, "centimetres, as its columns say: --source.scale=0.01"),
+        ("x [m],y", 1.0, ""),
+    ],
+)
+def test_units_of_columns_are_used_and_told(tmp_path: Path, names: str, scale: float, told: str) -> None:
+    content = text(["time [ms]", *names.split(",")], [1000 * TIMES, *(STRAIGHT / scale).T])
+    path, lines = written(tmp_path / "a.csv", content), []
+    (recording,) = read_handwriting(path, tell=lines.append)
+    np.testing.assert_allclose(recording.values, STRAIGHT, atol=1e-12)
+    assert lines == ([f"{path} is read in {told}"] if told else [])
+    (recording,) = read_handwriting(path, scale=2.0)
+    np.testing.assert_allclose(recording.values, 2 * STRAIGHT / scale, atol=1e-9)
+
+
+def test_positions_in_several_units_are_refused(tmp_path: Path) -> None:
+    path = written(tmp_path / "a.csv", text(["time", "x [mm]", "y"], [TIMES, *STRAIGHT.T]))
+    with pytest.raises(ValueError, match=r"a.csv: positions of the pen must have one unit, got x \[mm\], y"):
+        read_handwriting(path)
+
+
+@pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"scale": 0.0}, "scale must be a finite length above 0 m, got 0.0"),

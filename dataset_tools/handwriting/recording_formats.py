@@ -17,8 +17,7 @@ from lerobot_pf2mp.dataset_tools.handwriting.recorded_tablet import (
     tablet_recording,
 )
 
-_EPISODES = {".csv": read_table, ".tsv": read_table, ".jsonl": read_json_lines}
-_RECORDINGS = {".svc": read_svc, ".mat": read_matlab}
+_READERS = {".csv": read_table, ".tsv": read_table, ".svc": read_svc, ".mat": read_matlab}
 _OMNIGLOT = (".zip", ".txt")
 
 
@@ -47,10 +46,10 @@ def read_recording(path: Path, character: str | None = None) -> Recording:
         raise ValueError(f"--source.character is for Omniglot's drawings, got another recording: {path}")
     if path.is_dir():
         return Recording(read_dataset(path))
-    if suffix in _RECORDINGS:
-        return _RECORDINGS[suffix](path)
-    if suffix in _EPISODES:
-        return Recording(_EPISODES[suffix](path))
+    if suffix in _READERS:
+        return _READERS[suffix](path)
+    if suffix == ".jsonl":
+        return Recording(read_json_lines(path))
     if suffix != ".json":
         raise ValueError(
             "a recording must be a .csv or .json file or a LeRobotDataset's folder, or a .tsv, .jsonl, .svc (tablets), .mat "

@@ -36,7 +36,7 @@ class SourceConfig:
     # [0,0,0,0,0,-1.5708,-0.7854] for a real Panda.
     joint_offsets: list[float] = field(default_factory=list)
     # Handwriting: length of the unit in which positions of the pen were recorded [m]: 0.001 for millimetres. By default what
-    # the format says, which is then printed: metres for CSV, JSON and JSONL files.
+    # the format says, which is then printed: metres for JSON and JSONL files, and for CSV files unless x [mm] is a column.
     scale: float | None = None
     # Handwriting: where x = y = 0 of the recorded positions of the pen lies in the frame of the arm's base [m], for example
     # [0.34,-0.16], the sheet's corner on the right of the arm. By default CSV, JSON and JSONL files are in that frame
