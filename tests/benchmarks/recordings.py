@@ -56,7 +56,7 @@ class RecordingsConfig:
     output_dir: Path = Path("results/recordings")
     # The recording left out, and the number of episodes, in the figure.
     shown: int = 0
-    n_episodes: int = 60
+    n_episodes: int = 20
 
 
 def main(config: RecordingsConfig) -> None:
