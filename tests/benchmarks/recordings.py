@@ -8,6 +8,7 @@
 --dataset.episodes=ALL_BUT_$k --output_dir=outputs/PandaSymbol/without_$k
     done
     python tests/benchmarks/recordings.py
+    pf2mp-benchmark --config_path=eval_configs/benchmark_panda_symbol.yaml
 
 Forbidden is everything within 2 cm of the recordings' bounding box that is more than 8 mm away from all six of them: where
 no recording was. 8 mm is the distance of a letter's regions. The stroke to write is the recording nearest to the others.
