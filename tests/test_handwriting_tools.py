@@ -788,7 +788,7 @@ def without(columns: dict, *names: str) -> dict:
         ),
         (
             stacked(*[columns_of(PLACES, times=np.array([0.0, 0.3, 0.1, 0.4, 0.5, 0.6]))] * 2),
-            "none that is usable: times must increase, got 0.1 after 0.3 in row 2 of episode 0",
+            r"usable \(2 whose times do not increase\): times must increase, got 0.1 after 0.3 in row 2",
         ),
         (columns_of(PLACES[:2]), "episode 0 of .* at least 3 samples, .* got 2 times and 2 samples"),
         (columns_of(PLACES[:0]), "others.csv must hold at least one episode, got none"),
