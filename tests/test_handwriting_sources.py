@@ -2,6 +2,7 @@
 """Recordings of handwriting as tablets, robots and spreadsheets leave them."""
 
 import json
+import re
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -270,11 +271,35 @@ def test_millimetres_of_another_sheet_become_metres_in_the_frame_of_the_arm(tmp_
 
 
 @pytest.mark.parametrize(
+    ("names", "scale", "told"),
+    [
+        ("x [mm],y [mm]", 0.001, "millimetres, as its columns say: --source.scale=0.001"),
+        ("X (CM),pos_y (cm)", 0.01, "centimetres, as its columns say: --source.scale=0.01"),
+        ("x [m],y", 1.0, ""),
+    ],
+)
+def test_units_of_columns_are_used_and_told(tmp_path: Path, names: str, scale: float, told: str) -> None:
+    content = text(["time [ms]", *names.split(",")], [1000 * TIMES, *(STRAIGHT / scale).T])
+    path, lines = written(tmp_path / "a.csv", content), []
+    (recording,) = read_handwriting(path, tell=lines.append)
+    np.testing.assert_allclose(recording.values, STRAIGHT, atol=1e-12)
+    assert lines == ([f"{path} is read in {told}"] if told else [])
+    (recording,) = read_handwriting(path, scale=2.0)
+    np.testing.assert_allclose(recording.values, 2 * STRAIGHT / scale, atol=1e-9)
+
+
+def test_positions_in_several_units_are_refused(tmp_path: Path) -> None:
+    path = written(tmp_path / "a.csv", text(["time", "x [mm]", "y"], [TIMES, *STRAIGHT.T]))
+    with pytest.raises(ValueError, match=r"a.csv: positions of the pen must have one unit, got x \[mm\], y"):
+        read_handwriting(path)
+
+
+@pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"scale": 0.0}, "scale must be a finite length above 0 m, got 0.0"),
         ({"scale": np.nan}, "scale must be a finite length above 0 m, got nan"),
-        ({"scale": None}, "scale must be a finite length above 0 m, got None"),
+        ({"scale": -0.001}, "scale must be a finite length above 0 m, got -0.001"),
         ({"place": [0.5]}, r"place must be two finite positions x, y \[m\], got \[0.5\]"),
         ({"place": [0.5, None]}, r"place must be two finite positions x, y \[m\], got \[0.5, None\]"),
         (
@@ -297,11 +322,12 @@ def test_units_and_places_of_the_pen_are_refused_for_joints(tmp_path: Path, opti
 
 def test_positions_off_the_sheet_are_refused_naming_the_row(tmp_path: Path) -> None:
     places = STRAIGHT.copy()
-    places[4, 1] = 0.3
-    path = written(tmp_path / "a.csv", text(["time", "x", "y"], [TIMES, *places.T]))
+    places[4, 1] = 0.2
     options = {"root": tmp_path / "d", "repo_id": "a/b", "n_steps": 5, "scene_options": {}}
-    with pytest.raises(ValueError, match=r"must lie on the sheet, .* got \[.*, 0.3\] in row 4"):
-        convert_handwriting(path, "pen", **options)
+    for scale, message in ((1, "0.2] in row 4; --source.place moves"), (1000, "larger than the sheet; mill")):
+        path = written(tmp_path / "a.csv", text(["time", "x", "y"], [TIMES, *(places * scale).T]))
+        with pytest.raises(ValueError, match=f"must lie on the sheet, .* got .*{re.escape(message)}"):
+            convert_handwriting(path, "pen", **options)
 
 
 # Datasets of LeRobot

@@ -784,11 +784,11 @@ def without(columns: dict, *names: str) -> dict:
         # Times
         (
             columns_of(PLACES, times=np.array([0.0, 0.1, 0.2, 0.2, 0.3, 0.4])),
-            "times must increase, got 0.2 s after 0.2 s in row 3 of episode 0 of .*others.csv",
+            "times must increase, got 0.2 after 0.2 in row 3 of episode 0 of .*others.csv",
         ),
         (
             stacked(*[columns_of(PLACES, times=np.array([0.0, 0.3, 0.1, 0.4, 0.5, 0.6]))] * 2),
-            "none that is usable: times must increase, got 0.1 s after 0.3 s in row 2 of episode 0",
+            r"usable \(2 whose times do not increase\): times must increase, got 0.1 after 0.3 in row 2",
         ),
         (columns_of(PLACES[:2]), "episode 0 of .* at least 3 samples, .* got 2 times and 2 samples"),
         (columns_of(PLACES[:0]), "others.csv must hold at least one episode, got none"),
@@ -863,7 +863,7 @@ def test_files_that_are_not_csv_are_refused_and_named(tmp_path: Path, content: b
         ),
         (
             {"episodes": [episode(PLACES, time=[5, 4, 3, 2, 1, 0])]},
-            "times must increase, got 4 s after 5 s in row 1",
+            "times must increase, got 4 after 5 in row 1",
         ),
     ],
 )

@@ -46,7 +46,7 @@ print("discovered")
 """
 
 
-HORIZONS = {"maze": 80, "fetch": 48, "handwriting": 64}
+HORIZONS = {"maze": 80, "fetch": 48, "handwriting": 64, "panda_symbol": 64}
 ENVS = {"maze": PF2MPMazeEnv, "fetch": PF2MPFetchEnv, "handwriting": PF2MPHandwritingEnv}
 
 

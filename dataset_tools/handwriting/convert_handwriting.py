@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory, check_n_ste
 from lerobot_pf2mp.dataset_tools.writing.write_trajectories import write_trajectories
 from lerobot_pf2mp.envs.handwriting.handwriting_env import HandwritingEnv
 from lerobot_pf2mp.envs.handwriting.ink import INK_HEIGHT
+from lerobot_pf2mp.envs.handwriting.sheet import SHEET_SIDE
 from lerobot_pf2mp.envs.handwriting.writing_scene import check_on_sheet
 
 _MOST_FRAMES = 10**6
@@ -33,8 +34,11 @@ def convert_handwriting(
     n_steps: int,
     scene_options: dict[str, Any],
     joint_offsets: Sequence[float] = (),
-    scale: float = 1.0,
+    scale: float | None = None,
     place: Sequence[float] | None = None,
+    strokes: str = "one",
+    character: str | None = None,
+    tell: Callable[[str], None] = lambda line: None,
     n_episodes: int | None = None,
     overwrite: bool = False,
 ) -> tuple[int, Counter[str]]:
@@ -51,8 +55,11 @@ def convert_handwriting(
         n_steps: Steps T that each episode is resampled to.
         scene_options: Arguments of `make_writing_scene`; its regions must not be entered.
         joint_offsets: As for `RecordingFrame`.
-        scale: As for `RecordingFrame`.
-        place: As for `RecordingFrame`.
+        scale: As for `read_handwriting`.
+        place: As for `read_handwriting`.
+        strokes: As for `StrokeChoice`.
+        character: As for `read_recording`.
+        tell: As for `read_handwriting`.
         n_episodes: Largest number of episodes to write; None writes all.
         overwrite: Whether an existing dataset is replaced.
 
@@ -68,7 +75,16 @@ def convert_handwriting(
     check_n_steps(n_steps)
     env = HandwritingEnv("joint", control="exact", **scene_options)
     left_out: Counter[str] = Counter()
-    recordings = read_handwriting(path, joint_offsets, scale=scale, place=place, left_out=left_out)
+    recordings = read_handwriting(
+        path,
+        joint_offsets,
+        scale=scale,
+        place=place,
+        strokes=strokes,
+        character=character,
+        left_out=left_out,
+        tell=tell,
+    )
     _check_frames(n_steps, len(recordings) if n_episodes is None else min(n_episodes, len(recordings)))
     n_written, dropped = write_trajectories(
         _usable(path, recordings, env, space, n_steps, left_out),
@@ -126,13 +142,24 @@ def _trajectories(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Joint positions ``(T + 1, 9)`` [rad; m], and positions ``(T + 1, 2)`` and heights ``(T + 1,)`` of the pen [m]."""
     if recording.values.shape[1] == 2:
-        check_on_sheet(recording.values, f"the pen in {recording.name}")
+        _check_pen(recording)
         positions = recording.resampled(n_steps)
         return env.kinematics.joint_trajectory(positions), positions, np.zeros(n_steps + 1)
     env.check_joints(recording.values, f"the joints in {recording.name}")
     joints = recording.resampled(n_steps)
     tips = env.kinematics.tips(joints)
     return joints, tips[:, :2], tips[:, 2]
+
+
+def _check_pen(recording: HandwritingRecording) -> None:
+    """Refuses a recorded pen that leaves the sheet, and names the option that may help."""
+    try:
+        check_on_sheet(recording.values, f"the pen in {recording.name}")
+    except ValueError as error:
+        is_too_large = np.ptp(recording.values, axis=0).max() > SHEET_SIDE
+        too_large = "larger than the sheet; millimetres need --source.scale=0.001"
+        hint = f"it is {too_large}" if is_too_large else "--source.place moves the recording"
+        raise ValueError(f"{error}; {hint}") from error
 
 
 def _collides(env: HandwritingEnv, joints: np.ndarray) -> bool:

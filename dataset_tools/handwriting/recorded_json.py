@@ -26,15 +26,20 @@ _LAYOUT = (
 )
 
 
-def read_json(path: Path) -> list[RecordedEpisode]:
-    """Reads the episodes of a JSON file.
+def episodes_of_json(content: Any, path: Path) -> list[RecordedEpisode]:
+    """The episodes of a JSON file.
+
+    Args:
+        content: What it holds.
+        path: The file, for error messages.
 
     Raises:
         ValueError: If it has another layout.
     """
-    content = _parsed(path.read_bytes(), str(path))
     if not isinstance(content, dict) or not isinstance(content.get("episodes"), list):
-        raise ValueError(f'{path} must hold {{"episodes": [...]}}')
+        raise ValueError(
+            f'{path} must hold {{"episodes": [...]}}, or {{"data": {{"x": [...], ...}}}} of a tablet'
+        )
     return [_episode(each, number, path) for number, each in enumerate(content["episodes"])]
 
 
@@ -45,7 +50,7 @@ def read_json_lines(path: Path) -> list[RecordedEpisode]:
         ValueError: If it has another layout.
     """
     lines = [(number, line) for number, line in enumerate(path.read_bytes().splitlines(), 1) if line.strip()]
-    contents = [(number, _parsed(line, f"line {number} of {path}")) for number, line in lines]
+    contents = [(number, parsed(line, f"line {number} of {path}")) for number, line in lines]
     if not contents or not all(isinstance(content, dict) for _, content in contents):
         raise ValueError(f"{path} must hold a JSON object in each line")
     header = list(contents[0][1])
@@ -55,7 +60,16 @@ def read_json_lines(path: Path) -> list[RecordedEpisode]:
     return episodes_of(header, rows, path)
 
 
-def _parsed(content: bytes, name: str) -> Any:
+def parsed(content: bytes, name: str) -> Any:
+    """What a JSON text holds.
+
+    Args:
+        content: The text, in UTF-8 with or without a mark at its beginning.
+        name: Its name, for the error message.
+
+    Raises:
+        ValueError: If it is no JSON.
+    """
     try:
         return json.loads(content.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:

@@ -42,7 +42,8 @@ _SPELLINGS = {
 _MEANING_OF = {spelling: meaning for meaning, spellings in _SPELLINGS.items() for spelling in spellings}
 _FINGER = re.compile(r"(?:.*[_./])?finger(?:_joint)?[_ ]?(\d)(?:[._](?:pos|position))?")
 _JOINT = re.compile(r"(?:.*[_./])?(?:joint|q|j)[_ ]?(\d)(?:[._](?:pos|position))?")
-_UNIT = re.compile(r"\s*[\[(](?:s|m|rad)[\])]$")
+_UNIT = re.compile(r"\s*[\[(](s|ms|m|cm|mm|rad)[\])]$")
+_LENGTHS = {"mm": (0.001, "millimetres"), "cm": (0.01, "centimetres")}
 _DISPLACEMENT = re.compile(
     r"d[xyz]|delta|rel|relative|diff|displacement|vel|velocity|speed|acc|torque|effort"
 )
@@ -66,6 +67,23 @@ def meanings(names: Sequence[str]) -> list[str | None]:
         ]
     known = {*JOINT_NAMES, *_SPELLINGS, "time"}
     return [each if each in known else None for each in found]
+
+
+def length_unit(names: Sequence[str]) -> tuple[float | None, str]:
+    """The unit [m] in which positions of the pen were recorded, and its name, if names say one that is not the metre.
+
+    Raises:
+        ValueError: If they say several.
+    """
+    plain = [name.strip().lower() for name in names]
+    of_pen = [
+        name for name, meaning in zip(plain, meanings(names), strict=True) if meaning in ("x", "y", "z")
+    ]
+    units = {found[1] if (found := _UNIT.search(name)) else "m" for name in of_pen}
+    if len(units) > 1:
+        raise ValueError(f"positions of the pen must have one unit, got {', '.join(of_pen)}")
+    scale, unit = _LENGTHS.get("".join(units), (None, ""))
+    return scale, f"{unit}, as its columns say" if unit else ""
 
 
 def other_data(names: Sequence[str]) -> str | None:

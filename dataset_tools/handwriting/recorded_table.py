@@ -11,13 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_pf2mp.dataset_tools.handwriting.recorded_episode import RecordedEpisode
+from lerobot_pf2mp.dataset_tools.handwriting.recorded_episode import RecordedEpisode, Recording
 from lerobot_pf2mp.dataset_tools.handwriting.recorded_names import (
     ARM,
     ARM_AND_FINGERS,
     PEN,
     PEN_STATES,
     are_poses,
+    length_unit,
     meanings,
     other_data,
 )
@@ -29,8 +30,8 @@ _TRUE, _FALSE = ("true", "yes", "down"), ("false", "no", "up")
 _Row = tuple[int, Sequence[str]]  # the number of its line in the file, and its cells
 
 
-def read_table(path: Path) -> list[RecordedEpisode]:
-    """Reads the episodes of a CSV or TSV file.
+def read_table(path: Path) -> Recording:
+    """Reads a CSV or TSV file.
 
     Columns are separated by commas, semicolons or tabs, whichever the header holds most of, or by what a first line ``sep=``
     says. Numbers may have a decimal comma. Empty lines are skipped.
@@ -44,9 +45,16 @@ def read_table(path: Path) -> list[RecordedEpisode]:
     try:
         rows = _rows(path.read_text(encoding="utf-8-sig"))
         _, header = next(rows, (1, []))
-        return episodes_of(header, list(rows), path)
+        return Recording(episodes_of(header, list(rows), path), *_length_unit(header, path))
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path} must be a CSV file in UTF-8, got {error}") from error
+
+
+def _length_unit(header: Sequence[str], path: Path) -> tuple[float | None, str]:
+    try:
+        return length_unit(header)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
 
 
 def _number(cell: str) -> float:

@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Real
 from pathlib import Path
 
 import numpy as np
 
 from lerobot_pf2mp.envs.handwriting.panda import GRIP, N_ARM_JOINTS
+from lerobot_pf2mp.envs.handwriting.sheet import SHEET_CENTRE
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class RecordingFrame:
 
     Args:
         joint_offsets: Added to the seven joints of the recording [rad]; an empty sequence adds nothing.
-        scale: Length of the unit in which positions of the pen were recorded [m].
+        scale: Length of the unit in which positions of the pen were recorded [m]; None is 1 m.
         place: Where x = y = 0 of these positions lies in the frame of the arm's base, x, y [m]; None leaves it there.
 
     Raises:
@@ -28,7 +29,7 @@ class RecordingFrame:
     """
 
     joint_offsets: Sequence[float] = ()
-    scale: float = 1.0
+    scale: float | None = None
     place: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
@@ -36,7 +37,7 @@ class RecordingFrame:
             raise ValueError(
                 f"joint_offsets must be {N_ARM_JOINTS} finite angles [rad], got {list(self.joint_offsets)}"
             )
-        if not _are_finite([self.scale]) or self.scale <= 0:
+        if self.scale is not None and (not _are_finite([self.scale]) or self.scale <= 0):
             raise ValueError(f"scale must be a finite length above 0 m, got {self.scale}")
         if self.place is not None and (len(self.place) != 2 or not _are_finite(self.place)):
             raise ValueError(f"place must be two finite positions x, y [m], got {list(self.place)}")
@@ -51,13 +52,22 @@ class RecordingFrame:
 
     def of_pen(self, values: np.ndarray) -> np.ndarray:
         """``(N, 2)`` positions of the pen [m] for the recorded ones."""
-        return self.scale * values + np.array([0.0, 0.0] if self.place is None else self.place)
+        return self.metres(values) + np.array([0.0, 0.0] if self.place is None else self.place)
+
+    def metres(self, lengths: np.ndarray) -> np.ndarray:
+        """Recorded lengths in metres, in the shape of `lengths`."""
+        return (1.0 if self.scale is None else self.scale) * lengths
+
+    def centred(self, values: np.ndarray) -> RecordingFrame:
+        """The frame in which the middle of ``(N, 2)`` recorded positions lies in the middle of the sheet, to 0.1 mm."""
+        middle = self.metres((values.min(axis=0) + values.max(axis=0)) / 2)
+        return replace(self, place=np.round(np.array(SHEET_CENTRE) - middle, 4).tolist())
 
     def check_used(self, with_joints: bool, with_pen: bool, path: Path) -> None:
         """Refuses settings that apply to nothing in a recording."""
         if len(self.joint_offsets) and not with_joints:
             raise ValueError(f"joint_offsets are for recordings of joints, got one of the pen: {path}")
-        if (self.scale != 1.0 or self.place is not None) and not with_pen:
+        if (self.scale is not None or self.place is not None) and not with_pen:
             raise ValueError(f"scale and place are for recordings of the pen, got one of joints: {path}")
 
 

@@ -27,18 +27,26 @@ class SourceConfig:
 
     # Layout of the recording: d4rl (maze2d, one HDF5 file), minari (pointmaze, a folder), fetch (gymnasium-robotics'
     # FetchReach or FetchPush: an npz file, or the folder of a Minari dataset) or handwriting (a CSV, TSV, JSON or JSONL
-    # file, or the folder of a LeRobotDataset with joint actions).
+    # file, the folder of a LeRobotDataset with joint actions, or recordings of others: an SVC or JSON file of a Wacom
+    # tablet, a .mat file of LASA or of the Panda symbols, the zip file or a folder of Omniglot's strokes).
     type: str = "d4rl"
     # The file or folder.
     path: Path | None = None
     # Handwriting: seven angles to add to the recorded joints [rad], if the arm has other zero positions:
     # [0,0,0,0,0,-1.5708,-0.7854] for a real Panda.
     joint_offsets: list[float] = field(default_factory=list)
-    # Handwriting: length of the unit in which positions of the pen were recorded [m]: 0.001 for millimetres.
-    scale: float = 1.0
+    # Handwriting: length of the unit in which positions of the pen were recorded [m]: 0.001 for millimetres. By default what
+    # the format says, which is then printed: metres for JSON and JSONL files, and for CSV files unless x [mm] is a column.
+    scale: float | None = None
     # Handwriting: where x = y = 0 of the recorded positions of the pen lies in the frame of the arm's base [m], for example
-    # [0.34,-0.16], the sheet's corner on the right of the arm. By default the recording is in that frame already.
+    # [0.34,-0.16], the sheet's corner on the right of the arm. By default CSV, JSON and JSONL files are in that frame
+    # already, and recordings of others are put in the middle of the sheet, which is then printed.
     place: list[float] | None = None
+    # Handwriting: which strokes of a drawing become demonstrations: one (drawings in which the pen is lifted in between are
+    # left out), each (every stroke is a demonstration), or the number of a stroke, from 1.
+    strokes: str = "one"
+    # Omniglot: the character, ALPHABET/CHARACTER, for example Greek/character03, unless the path holds only one.
+    character: str | None = None
 
 
 @dataclass
@@ -55,6 +63,10 @@ class ConvertConfig(WritingConfig):
         pf2mp-convert --source.type=handwriting --source.path=strokes.csv --task=handwriting_pen --root=data/mine
         pf2mp-convert --source.type=handwriting --source.path=tablet.csv --source.scale=0.001 --source.place=[0.34,-0.16] \
 --task=handwriting_joint --root=data/tablet
+        pf2mp-convert --source.type=handwriting --source.path=symbol_17.mat --task=handwriting_pen --scene_file=symbol.json \
+--root=data/symbol
+        pf2mp-convert --source.type=handwriting --source.path=strokes_background_small1.zip \
+--source.character=Greek/character13 --n_regions=0 --task=handwriting_pen --root=data/omniglot
         pf2mp-convert --source.type=handwriting --source.path=data/teleoperated --task=handwriting_joint \
 --scene_file=my_stroke.json --root=data/mine
 
@@ -70,9 +82,16 @@ class ConvertConfig(WritingConfig):
     or "pen": [[x, y], ...] instead; JSONL files have such an episode, or a sample {"time": 0.1, "x": 0.5, "y": 0.1}, in each
     line. Of a LeRobotDataset the actions are used, by their names: 7 joints, or 7 joints and 2 fingers.
 
+    Recordings of others, from a sheet of their own: SVC and JSON files of the package handwriting-sample (x, y, time, pen
+    status, ...; millimetres, or whole numbers for counts of the tablet, 5080 or "lpi" in an inch). MATLAB files of version 5
+    to 7 with LASA's demos (pos and t; millimetres) or the Panda symbols' symbol_data (pos; metres, 1 kHz). Omniglot's
+    strokes (x, y, time between START and BREAK; 105 pixels become 0.18 m). Unit and place are printed as the options that
+    say the same. x points away from the arm there too, so that a page is written with its right side ahead.
+
     A demonstration of handwriting is one stroke. Columns pen_down, pen_up, pressure or z (height of the pen above the table)
     tell where the pen is lifted: what comes before the stroke and after it is left out, and so are episodes in which the pen
-    is lifted in between, in which the times do not increase, or with fewer than 3 samples.
+    is lifted in between (but see --source.strokes), in which the times do not increase, or with fewer than 3 samples. Times
+    may have any unit: each demonstration is resampled to --n_steps equal shares of its duration.
 
     Trajectories of a maze end where timeouts or terminals of D4RL say so, and where the goal changes. Those that end more
     than 0.5 m from their goal, cut off, are left out. A recording in another maze is refused; a maze that no task has is
@@ -183,6 +202,9 @@ def _convert_handwriting(config: ConvertConfig, path: Path) -> None:
         joint_offsets=config.source.joint_offsets,
         scale=config.source.scale,
         place=config.source.place,
+        strokes=config.source.strokes,
+        character=config.source.character,
+        tell=print,
         n_episodes=config.n_episodes,
     )
     write_and_report(config, config.task, HANDWRITING_STEPS, write)
