@@ -35,6 +35,7 @@ class PF2MPHandwritingEnv(CollisionEnvConfig):
         control: physics (position controllers in full physics) or exact (the arm reaches every action).
         render_size: Width of the rendered image [pixels].
         camera: arm (from the side) or top (the sheet alone).
+        robot: The arm: panda, or unitree_z1, which needs the extra z1.
     """
 
     task: str | None = "HandwritingJoint-v0"
@@ -48,18 +49,23 @@ class PF2MPHandwritingEnv(CollisionEnvConfig):
     control: str = "physics"
     render_size: int = 640
     camera: str = "arm"
+    robot: str = "panda"
 
     def __post_init__(self) -> None:
         """Validates the task and its scene.
 
         Raises:
-            ConfigError: If the task does not exist, or its scene is not possible.
+            ConfigError: If the task or the robot does not exist, the arm's package is missing, or the scene is not possible.
         """
         if self.task not in HANDWRITING_TASKS:
             raise ConfigError(f"task must be one of {list(HANDWRITING_TASKS)}, got {self.task!r}")
+        # Imported here because LeRobot imports this file for every command.
+        from lerobot_pf2mp.envs.handwriting.arm import find_arm
+
         with reported_on_the_command_line():
+            arm = find_arm(self.robot)
             _ = self.scene
-            dim = 9 if HANDWRITING_TASKS[self.task] == "joint" else 2
+            dim = len(arm.joint_names) if HANDWRITING_TASKS[self.task] == "joint" else 2
             self._describe(dim, 0, lambda: image_size_of(self.render_size))
 
     @property
@@ -81,6 +87,7 @@ class PF2MPHandwritingEnv(CollisionEnvConfig):
             "render_mode": "rgb_array",
             "render_size": self.render_size,
             "camera": self.camera,
+            "robot": self.robot,
         }
 
     @property
