@@ -26,7 +26,7 @@ from lerobot.scripts.lerobot_eval import rollout
 from torch import nn
 
 from lerobot_pf2mp import PF2MPHandwritingEnv
-from lerobot_pf2mp.envs.handwriting.handwriting_env import START_SPREAD, HandwritingEnv
+from lerobot_pf2mp.envs.handwriting.handwriting_env import HandwritingEnv
 from lerobot_pf2mp.envs.handwriting.ink import COVERED, INK_HEIGHT, LARGEST_ERROR, Ink
 from lerobot_pf2mp.envs.handwriting.letters import LETTERS
 from lerobot_pf2mp.envs.handwriting.panda import HOME, JOINT_NAMES
@@ -34,6 +34,7 @@ from lerobot_pf2mp.envs.handwriting.pen import PEN_TRAVEL
 from lerobot_pf2mp.envs.handwriting.regions import Disc
 from lerobot_pf2mp.envs.handwriting.sheet import SHEET_CENTRE, SHEET_SIDE
 from lerobot_pf2mp.envs.handwriting.stroke import evenly_spaced
+from lerobot_pf2mp.envs.handwriting.writing_episode import START_SPREAD
 from lerobot_pf2mp.envs.handwriting.writing_model import TABLE
 from lerobot_pf2mp.envs.handwriting.writing_scene import WritingScene, make_writing_scene
 from lerobot_pf2mp.envs.tasks import HANDWRITING_TASKS
@@ -500,6 +501,7 @@ def test_every_task_is_its_space_for_64_steps(task: str, space: str) -> None:
         "is_collision": bool,
         "clearance": float,
         "stroke_error": float,
+        "beyond_reach": float,
         "path_length": float,
     }
     assert type(reward) is float

@@ -23,11 +23,12 @@ from lerobot_pf2mp.dataset_tools.handwriting.handwriting_recording import read_h
 from lerobot_pf2mp.dataset_tools.writing.attempts import successful
 from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory
 from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, write_dataset
-from lerobot_pf2mp.envs.handwriting.handwriting_env import CONTROLS, SPACES, START_SPREAD, HandwritingEnv
+from lerobot_pf2mp.envs.handwriting.handwriting_env import CONTROLS, SPACES, HandwritingEnv
 from lerobot_pf2mp.envs.handwriting.panda import ARM, GRIP, HOME, JOINT_NAMES
 from lerobot_pf2mp.envs.handwriting.pen import PEN_TIP
 from lerobot_pf2mp.envs.handwriting.sheet import SHEET_CENTRE, SHEET_SIDE
 from lerobot_pf2mp.envs.handwriting.stroke import distances
+from lerobot_pf2mp.envs.handwriting.writing_episode import START_SPREAD
 from lerobot_pf2mp.envs.handwriting.writing_model import make_writing_model
 from lerobot_pf2mp.envs.handwriting.writing_scene import make_writing_scene
 

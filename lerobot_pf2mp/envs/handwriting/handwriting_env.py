@@ -24,14 +24,14 @@ from lerobot_pf2mp.envs.handwriting.sheet import (
     REGION_GAP,
 )
 from lerobot_pf2mp.envs.handwriting.sheet_image import draw_sheet
+from lerobot_pf2mp.envs.handwriting.writing_episode import WritingEpisode, first_position
 from lerobot_pf2mp.envs.handwriting.writing_model import TABLE, make_writing_model, movers
-from lerobot_pf2mp.envs.handwriting.writing_scene import SHEET_CORNERS, check_on_sheet, make_writing_scene
+from lerobot_pf2mp.envs.handwriting.writing_scene import SHEET_CORNERS, make_writing_scene
 from lerobot_pf2mp.envs.image_size import image_size_of
 from lerobot_pf2mp.envs.obstacle import Obstacle
 
 SPACES = ("joint", "pen")
 CONTROLS = ("physics", "exact")
-START_SPREAD = 0.005  # largest distance between the pen's start and the stroke's beginning, on each axis [m]
 
 _LARGEST_SWEEP = 0.02  # largest motion of a joint between two checks for contact [rad]
 _MAX_SWEEPS = 200
@@ -139,17 +139,15 @@ class HandwritingEnv(gym.Env):
         self._table = Obstacle(self._model, self._data, TABLE, movers(self.arm, self._model))
         self._tip = self._data.site(PEN_TIP).xpos  # a view
         self.kinematics = PenKinematics(self.arm, self._model)
-        self._n_substeps = _substeps(fps, self._model.opt.timestep)
+        self._n_substeps = physics_steps(fps, self._model.opt.timestep)
         self.metadata = {**self.metadata, "render_fps": fps}
         self.action_space: spaces.Box = _action_space(space, self._model)
         # In full physics a joint may be pressed a little beyond its limit, and the pen may leave the sheet.
         self.observation_space = spaces.Dict(
             {"agent_pos": spaces.Box(-np.inf, np.inf, self.action_space.shape, dtype=np.float32)}
         )
-        self.ink = Ink(self.scene)
         self._target = self.arm.home.copy()
-        self._is_running = self._is_collision = False
-        self._beyond_reach = 0.0
+        self._episode: WritingEpisode | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -164,10 +162,8 @@ class HandwritingEnv(gym.Env):
         mujoco.mj_resetData(self._model, self._data)
         self._data.qpos[:] = self._data.ctrl[:] = self._target
         mujoco.mj_forward(self._model, self._data)
-        self.ink = Ink(self.scene)
-        self._is_running, self._is_collision, self._beyond_reach = True, False, 0.0
-        clearance = self.ink.draw(self._tip[None].copy())
-        return self._observation(), self._info(min(clearance, self._table.clearance()))
+        self._episode = WritingEpisode(self.scene, self._tip, self._table.clearance())
+        return self._observation(), self._episode.info
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Moves the arm to joint positions ``(J,)`` [rad; m], or to a position ``(2,)`` of the pen [m].
@@ -177,7 +173,7 @@ class HandwritingEnv(gym.Env):
         Raises:
             ValueError: If the action has another shape or is not finite.
         """
-        if not self._is_running:
+        if self._episode is None:
             raise gym.error.ResetNeeded("call reset() before step()")
         target = np.asarray(action, dtype=np.float64)
         if target.shape != self.action_space.shape or not np.isfinite(target).all():
@@ -185,18 +181,14 @@ class HandwritingEnv(gym.Env):
                 f"an action must be {self.action_space.shape[0]} finite positions, got {np.asarray(action).tolist()}"
             )
         target = target.clip(self.action_space.low, self.action_space.high)
-        joints, self._beyond_reach = target, 0.0
+        joints, beyond_reach = target, 0.0
         if self._space == "pen":
-            joints, self._beyond_reach = self.kinematics.nearest_joints(target)
+            joints, beyond_reach = self.kinematics.nearest_joints(target)
         move = self._move_exactly if self._control == "exact" else self._drive
         tips, table_clearance = move(joints)
         self._target = joints
-        ink_clearance = self.ink.draw(tips)
-        is_touching = min(table_clearance, ink_clearance) < 0
-        is_first = is_touching and not self._is_collision
-        self._is_collision |= is_touching
-        info = self._info(min(ink_clearance, table_clearance))
-        return self._observation(), -1.0 if is_first else 0.0, False, False, info
+        reward = self._episode.record(tips, table_clearance, beyond_reach)
+        return self._observation(), reward, False, False, self._episode.info
 
     def render(self) -> np.ndarray | None:
         """An image ``(H, W, 3)`` uint8 of the arm, the sheet and the drawn line.
@@ -206,9 +198,14 @@ class HandwritingEnv(gym.Env):
         """
         if self.render_mode is None:
             return None
-        if not self._is_running:
+        if self._episode is None:
             raise gym.error.ResetNeeded("call reset() before render()")
-        return self._camera.render(self._data, self.ink)
+        return self._camera.render(self._data, self._episode.ink)
+
+    @property
+    def ink(self) -> Ink:
+        """The line drawn in this episode."""
+        return Ink(self.scene) if self._episode is None else self._episode.ink
 
     @property
     def pen(self) -> np.ndarray:
@@ -223,6 +220,20 @@ class HandwritingEnv(gym.Env):
         """
         self.arm.check_joints(self._model, joints, name)
 
+    def table_clearance(self, joints: np.ndarray) -> float:
+        """Distance between the arm and the table at joint positions ``(J,)`` [m], negative if they touch."""
+        self._show(joints)
+        return self._table_clearance()
+
+    def draw(self, joints: np.ndarray, ink: Ink) -> np.ndarray:
+        """An image ``(H, W, 3)`` uint8 of the arm at joint positions ``(J,)`` [rad; m], and of a line.
+
+        Raises:
+            RuntimeError: If this machine cannot render; the message says what to install.
+        """
+        self._show(joints)
+        return self._camera.render(self._data, ink)
+
     def close(self) -> None:
         """Frees the camera."""
         self._camera.close()
@@ -236,15 +247,7 @@ class HandwritingEnv(gym.Env):
                 )
             self.check_joints(joints, "joints")
             return joints
-        start = options.get("start")
-        if start is None:
-            start = self.scene.stroke[0] + self.np_random.uniform(-START_SPREAD, START_SPREAD, 2)
-            start = start.clip(*SHEET_CORNERS)
-        start = np.asarray(start, dtype=np.float64)
-        if start.shape != (2,):
-            raise ValueError(f"start must be finite positions x, y [m], got {start.tolist()}")
-        check_on_sheet(start, "start")
-        return self.kinematics.joints(start)
+        return self.kinematics.joints(first_position(self.scene, options.get("start"), self.np_random))
 
     def _move_exactly(self, target: np.ndarray) -> tuple[np.ndarray, float]:
         """Moves the arm exactly to the target.
@@ -283,6 +286,10 @@ class HandwritingEnv(gym.Env):
         tips.append(self._tip.copy())
         return np.array(tips), min(clearance, self._table_clearance())
 
+    def _show(self, joints: np.ndarray) -> None:
+        self._data.qpos[:] = joints
+        mujoco.mj_fwdPosition(self._model, self._data)
+
     def _table_clearance(self) -> float:
         depth = self._table.contact_depth()
         return -depth if depth > 0 else self._table.clearance()
@@ -291,18 +298,17 @@ class HandwritingEnv(gym.Env):
         measured = self._data.qpos if self._space == "joint" else self._tip[:2]
         return {"agent_pos": measured.astype(np.float32)}
 
-    def _info(self, clearance: float) -> dict[str, Any]:
-        return {
-            "is_success": self.ink.is_success,
-            "is_collision": self._is_collision,
-            "clearance": clearance,
-            "stroke_error": self.ink.error,
-            "path_length": self.ink.length,
-            "beyond_reach": self._beyond_reach,
-        }
 
+def physics_steps(fps: int, timestep: float) -> int:
+    """Physics steps for each control step.
 
-def _substeps(fps: int, timestep: float) -> int:
+    Args:
+        fps: Control frequency [Hz].
+        timestep: Duration of a physics step [s].
+
+    Raises:
+        ValueError: If they are not a whole number.
+    """
     physics_fps = round(1 / timestep)
     if fps < 1 or physics_fps % fps:
         raise ValueError(f"fps must divide the physics' {physics_fps} Hz, got {fps}")

@@ -19,12 +19,12 @@ GRIP = 0.007  # opening of each finger around the pen [m]
 HOME = np.array([0.0, 0.3125, 0.0, -2.3932, 0.0, 1.135, 0.7854, GRIP, GRIP])  # [rad], fingers [m]
 
 _ASSETS = "envs/assets/kitchen_franka/franka_assets"
-_PEN = (0.16, 0.30)  # its blunt end and its tip, from the last joint's frame along its axis [m]
+PEN = (0.16, 0.30)  # its blunt end and its tip, from the last joint's frame along its axis [m]
 # Stiffness of the position controllers by joint [N m/rad], and the lag of the arm that their damping causes. With the
 # model's own gains the arm lags by 0.1 s, in some joints more than in others, which bends the stroke.
-_STIFFNESS = (4500.0, 4500.0, 3500.0, 3500.0, 2000.0, 2000.0, 2000.0)
-_LAG = 0.03  # [s]
-_FORCES = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)  # largest torques [N m]
+STIFFNESS = (4500.0, 4500.0, 3500.0, 3500.0, 2000.0, 2000.0, 2000.0)
+LAG = 0.03  # [s]
+FORCES = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)  # largest torques [N m]
 
 
 def _read() -> mujoco.MjSpec:
@@ -39,10 +39,10 @@ def _read() -> mujoco.MjSpec:
     for mesh in spec.meshes:  # their folder is given relative to another file
         path = Path(mesh.file)
         mesh.file = str(folder / "meshes" / path.parent.name / path.name)
-    add_pen(spec.body("panda0_link7"), "z", *_PEN)
-    for actuator, stiffness, force in zip(spec.actuators, _STIFFNESS, _FORCES, strict=False):
+    add_pen(spec.body("panda0_link7"), "z", *PEN)
+    for actuator, stiffness, force in zip(spec.actuators, STIFFNESS, FORCES, strict=False):
         actuator.gainprm[0] = stiffness
-        actuator.biasprm[1:3] = -stiffness, -stiffness * _LAG
+        actuator.biasprm[1:3] = -stiffness, -stiffness * LAG
         actuator.forcerange[:] = -force, force
         spec.joint(actuator.target).damping[:] = 1.0
     return spec

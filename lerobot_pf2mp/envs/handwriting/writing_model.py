@@ -13,7 +13,8 @@ from lerobot_pf2mp.envs.handwriting.sheet import SHEET_CENTRE, SHEET_SIDE
 TABLE = "table"
 ARM_GROUP, SCENE_GROUP = 0, 1  # MuJoCo's groups of visible geoms
 
-_TABLE_SIZE = (0.66, 0.80, 0.04)  # [m]
+TABLE_SIZE = (0.66, 0.80, 0.04)  # [m]
+TABLE_CENTRE = (SHEET_CENTRE[0] + 0.03, SHEET_CENTRE[1])  # x, y [m]
 _FLOOR = -0.44  # [m]
 _WHITE, _GREY = (0.80, 0.80, 0.79, 1.0), (0.32, 0.34, 0.37, 1.0)
 
@@ -53,14 +54,13 @@ def movers(arm: Arm, model: mujoco.MjModel) -> list[int]:
 def _add_table(spec: mujoco.MjSpec, sheet: np.ndarray, arm: Arm) -> None:
     world, box = spec.worldbody, mujoco.mjtGeom.mjGEOM_BOX
     spec.default.geom.group = SCENE_GROUP
-    length, width, height = _TABLE_SIZE
-    centre = (SHEET_CENTRE[0] + 0.03, SHEET_CENTRE[1])
+    length, width, height = TABLE_SIZE
     half = [length / 2, width / 2, height / 2]
     both = ARM_BIT | PEN_BIT
     world.add_geom(
         name=TABLE,
         type=box,
-        pos=[*centre, -height / 2],
+        pos=[*TABLE_CENTRE, -height / 2],
         size=half,
         rgba=_WHITE,
         contype=both,
@@ -68,7 +68,7 @@ def _add_table(spec: mujoco.MjSpec, sheet: np.ndarray, arm: Arm) -> None:
     )
     (x, side), top = arm.stand, arm.position[2]
     under_the_arm = [x, 0.0, (_FLOOR + top) / 2], [side, side, (top - _FLOOR) / 2]
-    for pos, size in (([*centre, -0.24], [0.25, 0.3, 0.2]), under_the_arm):
+    for pos, size in (([*TABLE_CENTRE, -0.24], [0.25, 0.3, 0.2]), under_the_arm):
         world.add_geom(type=box, pos=pos, size=size, rgba=_GREY, contype=0, conaffinity=0)
     texture = spec.add_texture(
         name="sheet",
