@@ -43,7 +43,7 @@ class GenesisPandas:
             show_viewer=False,
         )
         self._arm = self._scene.add_entity(
-            gs.morphs.MJCF(file=_arm_with_pen()), material=gs.materials.Rigid(gravity_compensation=1.0)
+            gs.morphs.MJCF(file=arm_with_pen()), material=gs.materials.Rigid(gravity_compensation=1.0)
         )
         length, width, height = TABLE_SIZE
         self._table = self._scene.add_entity(
@@ -108,7 +108,7 @@ class GenesisPandas:
         return contacts["valid_mask"].any(dim=-1).cpu().numpy()
 
 
-def _arm_with_pen() -> str:
+def arm_with_pen() -> str:
     """Genesis' model of the arm, with the same pen as in MuJoCo."""
     file = Path(gs.utils.get_assets_dir()) / _ARM
     spec = mujoco.MjSpec.from_file(str(file))
