@@ -80,10 +80,11 @@ class PF2MPHandwritingEnv(CollisionEnvConfig):
         """The vectorised environment, ``{type: {0: env}}``. With Genesis all arms are in one scene of this process."""
         if self.simulator == "mujoco":
             return super().create_envs(n_envs, use_async_envs)
-        from lerobot_pf2mp.envs.handwriting.genesis_env import GenesisHandwritingEnv
+        from lerobot_pf2mp.envs.handwriting.genesis_panda import GenesisPandas
+        from lerobot_pf2mp.envs.handwriting.many_arms_env import ManyArmsEnv
 
         space = HANDWRITING_TASKS[str(self.task)]
-        return {self.type: {0: GenesisHandwritingEnv(n_envs, space=space, **self.gym_kwargs)}}
+        return {self.type: {0: ManyArmsEnv(GenesisPandas(n_envs), n_envs, space=space, **self.gym_kwargs)}}
 
     def _check_simulator(self) -> None:
         if self.simulator not in SIMULATORS:

@@ -19,26 +19,26 @@ try:
 except ModuleNotFoundError as error:
     raise ImportError('the simulator genesis needs: pip install "lerobot_policy_pf2mp[genesis]"') from error
 
-TIMESTEP = 0.002  # of the physics, as in MuJoCo [s]
-
 _ARM = "xml/franka_emika_panda/panda.xml"
 _STEPS_BETWEEN_TIPS = 5  # physics steps, as in MuJoCo
 
 
 class GenesisPandas:
-    """Pandas that write, each at a table of its own. Joint positions are those of `panda`, as everywhere in this package.
+    """Pandas that write, each at a table of its own: the `Arms` of Genesis.
 
-    The positions controllers have the same gains as in MuJoCo, and gravity is compensated there, too.
+    The position controllers have the same gains as in MuJoCo, and gravity is compensated there, too.
 
     Args:
         n_arms: How many there are.
     """
 
+    timestep = 0.002  # as in MuJoCo
+
     def __init__(self, n_arms: int) -> None:
         if not gs._initialized:
             gs.init(backend=gs.cpu, logging_level="error")
         self._scene = gs.Scene(
-            sim_options=gs.options.SimOptions(dt=TIMESTEP),
+            sim_options=gs.options.SimOptions(dt=self.timestep),
             rigid_options=gs.options.RigidOptions(enable_self_collision=False),
             show_viewer=False,
         )
@@ -66,16 +66,7 @@ class GenesisPandas:
         self._target = joints.copy()
 
     def drive(self, target: np.ndarray, n_steps: int) -> tuple[np.ndarray, np.ndarray]:
-        """Drives all arms towards joint positions; the set points of the controllers move there at constant speed.
-
-        Args:
-            target: ``(n_arms, 9)`` joint positions [rad; m].
-            n_steps: Physics steps.
-
-        Returns:
-            ``(n_arms, T, 3)`` positions of the tips during the motion [m], the first of them those before it, and
-            ``(n_arms,)`` whether the arm or the pen's barrel has touched the table.
-        """
+        """Drives all arms towards joint positions, see `Arms.drive`."""
         before, tips = self._target, [self.tips()]
         has_touched = np.zeros(len(target), dtype=bool)
         for step in range(1, n_steps + 1):

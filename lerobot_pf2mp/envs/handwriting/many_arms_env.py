@@ -1,47 +1,81 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Handwriting in Genesis, many arms at once: the scene, the letters, the regions and the metrics of `HandwritingEnv`."""
+"""Handwriting with many arms in one scene of a simulator; letters, regions and metrics are those of `HandwritingEnv`."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import seeding
 
-from lerobot_pf2mp.envs.handwriting.genesis_panda import TIMESTEP, GenesisPandas
 from lerobot_pf2mp.envs.handwriting.handwriting_env import HandwritingEnv, physics_steps
 from lerobot_pf2mp.envs.handwriting.writing_episode import WritingEpisode, first_position
 
-_TOUCH = -1e-6  # clearance where Genesis saw a contact that is over at the end of the step [m]
+_TOUCH = -1e-6  # clearance of a step in which the simulator saw a contact that is over at its end [m]
 
 
-class GenesisHandwritingEnv(gym.vector.VectorEnv):
-    """Franka Pandas that must draw a letter without entering restricted regions, in one scene of Genesis.
+class Arms(Protocol):
+    """Arms of a simulator, each with a pen at a table of its own. Joint positions are those of `panda` [rad; m]."""
+
+    timestep: float
+    """Duration of a physics step [s]."""
+
+    def place(self, joints: np.ndarray) -> None:
+        """Puts all arms at rest at joint positions ``(N, J)``."""
+
+    def drive(self, target: np.ndarray, n_steps: int) -> tuple[np.ndarray, np.ndarray]:
+        """Drives all arms towards joint positions.
+
+        Args:
+            target: ``(N, J)`` joint positions, to which the controllers' set points move at constant speed.
+            n_steps: Physics steps.
+
+        Returns:
+            ``(N, T, 3)`` positions of the tips during the motion [m], the first of them those before it, and ``(N,)``
+            whether an arm or its pen's barrel has touched the table.
+        """
+
+    def joints(self) -> np.ndarray:
+        """The measured joint positions ``(N, J)``."""
+
+    def tips(self) -> np.ndarray:
+        """The positions ``(N, 3)`` of the pens' tips [m]."""
+
+    def close(self) -> None:
+        """Frees what the simulator holds."""
+
+
+class ManyArmsEnv(gym.vector.VectorEnv):
+    """Franka Pandas that must draw a letter without entering restricted regions, all moved by one simulator.
 
     Spaces, rewards, info and options are those of `HandwritingEnv` with ``control="physics"``, for each arm; joint positions
-    too. Genesis moves the arms and sees their contacts with the table. The model of `HandwritingEnv` measures clearances at
-    the joint positions in Genesis at the end of a step, and draws the images.
+    too. The simulator moves the arms and sees their contacts with the table. The model of `HandwritingEnv` measures
+    clearances at the simulator's joint positions at the end of a step, and draws the images.
 
     All episodes end together. Then nothing happens until the next reset.
 
     Args:
-        num_envs: Number of arms.
+        arms: The arms of the simulator.
+        num_envs: How many there are.
         max_episode_steps: Number of steps after which the episodes end.
-        fps: Control frequency [Hz], a divisor of the physics' 500 Hz.
+        fps: Control frequency [Hz], a divisor of the physics' frequency.
         **options: Other arguments of `HandwritingEnv`.
 
     Raises:
         ValueError: If an argument breaks its rule.
     """
 
-    def __init__(self, num_envs: int, *, max_episode_steps: int, fps: int, **options: Any) -> None:
-        self._judge = HandwritingEnv(fps=fps, **options)
+    def __init__(
+        self, arms: Arms, num_envs: int, *, max_episode_steps: int, fps: int, **options: Any
+    ) -> None:
         for name, needed in {"robot": "panda", "control": "physics"}.items():
             if options.get(name, needed) != needed:
-                raise ValueError(f"{name} must be {needed} with the simulator genesis, got {options[name]!r}")
+                raise ValueError(f"{name} must be {needed} with many arms, got {options[name]!r}")
+        self._arms = arms
+        self._judge = HandwritingEnv(fps=fps, **options)
         self.num_envs = num_envs
         self.metadata = {
             **self._judge.metadata,
@@ -56,8 +90,7 @@ class GenesisHandwritingEnv(gym.vector.VectorEnv):
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
         self._max_episode_steps = max_episode_steps
         self._is_joint_space = self.single_action_space.shape != (2,)
-        self._n_substeps = physics_steps(fps, TIMESTEP)
-        self._arms = GenesisPandas(num_envs)
+        self._n_substeps = physics_steps(fps, arms.timestep)
         self._generators: list[np.random.Generator] = []
         self._episodes: list[WritingEpisode] = []
         self._n_steps = 0
