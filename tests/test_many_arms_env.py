@@ -114,6 +114,8 @@ def test_lerobot_gets_what_it_asks_for() -> None:
     assert env.get_attr("task") == ("handwriting-joint",) * N_ENVS
     images = env.call("render")
     assert len(images) == N_ENVS and images[0].shape == (48, 64, 3)
+    np.testing.assert_array_equal(env.envs[1].render(), images[1])
+    np.testing.assert_array_equal([each.unwrapped.pen for each in env.envs], env._arms.tips())
     assert env.metadata["render_fps"] == 10
     assert env.action_space.shape == (N_ENVS, 9)
     with pytest.raises(AttributeError):

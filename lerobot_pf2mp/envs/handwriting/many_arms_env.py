@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -12,6 +13,7 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 
 from lerobot_pf2mp.envs.handwriting.handwriting_env import HandwritingEnv, physics_steps
+from lerobot_pf2mp.envs.handwriting.ink import Ink
 from lerobot_pf2mp.envs.handwriting.writing_episode import WritingEpisode, first_position
 
 _TOUCH = -1e-6  # clearance of a step in which the simulator saw a contact that is over at its end [m]
@@ -46,6 +48,32 @@ class Arms(Protocol):
 
     def close(self) -> None:
         """Frees what the simulator holds."""
+
+
+@dataclass(frozen=True)
+class OneArm:
+    """One of the arms at the time when it was asked for.
+
+    Args:
+        judge: The environment that draws it.
+        joints: ``(J,)`` joint positions [rad; m].
+        pen: ``(3,)`` position of the pen's tip [m].
+        ink: The line that it has drawn.
+    """
+
+    judge: HandwritingEnv
+    joints: np.ndarray
+    pen: np.ndarray
+    ink: Ink
+
+    @property
+    def unwrapped(self) -> OneArm:
+        """Itself."""
+        return self
+
+    def render(self) -> np.ndarray:
+        """An image ``(H, W, 3)`` uint8."""
+        return self.judge.draw(self.joints, self.ink)
 
 
 class ManyArmsEnv(gym.vector.VectorEnv):
@@ -143,12 +171,16 @@ class ManyArmsEnv(gym.vector.VectorEnv):
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """An image ``(H, W, 3)`` uint8 of each arm, drawn as `HandwritingEnv` draws its own."""
-        if self.render_mode is None:
-            return None
-        inks = (episode.ink for episode in self._episodes)
-        return tuple(
-            self._judge.draw(joints, ink) for joints, ink in zip(self._arms.joints(), inks, strict=True)
-        )
+        return None if self.render_mode is None else tuple(env.render() for env in self.envs)
+
+    @property
+    def envs(self) -> list[OneArm]:
+        """The environments of the arms, as far as figures need them."""
+        joints, tips = self._arms.joints(), self._arms.tips()
+        return [
+            OneArm(self._judge, each, tip, episode.ink)
+            for each, tip, episode in zip(joints, tips, self._episodes, strict=True)
+        ]
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """What the attribute or method of this name is or returns for each arm, as in Gymnasium's `SyncVectorEnv`."""
