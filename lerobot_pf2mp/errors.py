@@ -18,10 +18,10 @@ class ConfigError(ParsingError):
 
 @contextmanager
 def reported_on_the_command_line() -> Iterator[None]:
-    """Turns a ValueError or OSError of a `with` block into a `ConfigError` with the same message."""
+    """Turns a ValueError, OSError or ImportError of a `with` block into a `ConfigError` with the same message."""
     try:
         yield
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ImportError) as error:
         raise ConfigError(str(error)) from error
 
 

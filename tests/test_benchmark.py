@@ -849,6 +849,20 @@ def test_other_episodes_in_the_same_folder_are_an_error(
         assert (copied / path.name).read_bytes() == path.read_bytes()
 
 
+def test_settings_that_did_not_exist_when_a_benchmark_began_had_their_defaults(
+    copied: Path, whole_spec: BenchmarkSpec, evaluations: list[float]
+) -> None:
+    mark = copied / "run.json"
+    content = json.loads(mark.read_text())
+    assert content["episodes"]["env"].pop("control") == PF2MPMazeEnv().control == "exact"
+    mark.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match="other episodes"):
+        run_benchmark(replace(whole_spec, env=replace(whole_spec.env, control="pd")), copied)
+    run_benchmark(whole_spec, copied)
+    assert evaluations == []
+    assert json.loads(mark.read_text())["episodes"]["env"]["control"] == "exact"
+
+
 def test_another_checkpoint_of_the_same_name_in_the_same_folder_is_an_error(
     checkpoints: dict[str, str],
     copied: Path,

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
+import importlib.metadata
 import itertools
 import json
 import math
 import re
+import sys
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -24,13 +26,16 @@ from lerobot.scripts.lerobot_eval import rollout
 from torch import nn
 
 from lerobot_pf2mp import PF2MPHandwritingEnv
-from lerobot_pf2mp.envs.handwriting.handwriting_env import START_SPREAD, HandwritingEnv
+from lerobot_pf2mp.envs.handwriting.handwriting_env import HandwritingEnv
 from lerobot_pf2mp.envs.handwriting.ink import COVERED, INK_HEIGHT, LARGEST_ERROR, Ink
 from lerobot_pf2mp.envs.handwriting.letters import LETTERS
-from lerobot_pf2mp.envs.handwriting.panda import HOME, JOINT_NAMES, PEN_TRAVEL, TABLE
+from lerobot_pf2mp.envs.handwriting.panda import HOME, JOINT_NAMES
+from lerobot_pf2mp.envs.handwriting.pen import PEN_TRAVEL
 from lerobot_pf2mp.envs.handwriting.regions import Disc
 from lerobot_pf2mp.envs.handwriting.sheet import SHEET_CENTRE, SHEET_SIDE
 from lerobot_pf2mp.envs.handwriting.stroke import evenly_spaced
+from lerobot_pf2mp.envs.handwriting.writing_episode import START_SPREAD
+from lerobot_pf2mp.envs.handwriting.writing_model import TABLE
 from lerobot_pf2mp.envs.handwriting.writing_scene import WritingScene, make_writing_scene
 from lerobot_pf2mp.envs.tasks import HANDWRITING_TASKS
 from lerobot_pf2mp.errors import ConfigError
@@ -496,6 +501,7 @@ def test_every_task_is_its_space_for_64_steps(task: str, space: str) -> None:
         "is_collision": bool,
         "clearance": float,
         "stroke_error": float,
+        "beyond_reach": float,
         "path_length": float,
     }
     assert type(reward) is float
@@ -1312,6 +1318,7 @@ def test_the_configuration_hands_on_every_option() -> None:
         "fps": 25,
         "render_size": 64,
         "camera": "top",
+        "robot": "panda",
     }
     env = vector_env(PF2MPHandwritingEnv(task="HandwritingPen-v0", episode_length=9, **options), n_envs=1)
     inner = env.envs[0].unwrapped
@@ -1338,6 +1345,27 @@ def test_the_scene_of_the_configuration_is_that_of_the_environment(bar_file: str
         np.testing.assert_array_equal(scene.stroke, config.scene.stroke)
         assert scene.regions == config.scene.regions
         env.close()
+
+
+def test_a_robot_that_does_not_exist_is_refused() -> None:
+    message = r"robot must be one of \['panda', 'unitree_z1'\], got 'ur5'"
+    with pytest.raises(ConfigError, match=message):
+        PF2MPHandwritingEnv(robot="ur5")
+    with pytest.raises(ValueError, match=message):
+        HandwritingEnv("pen", robot="ur5")
+
+
+def test_a_robot_without_its_package_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> None:
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "distribution", missing)
+    monkeypatch.delitem(sys.modules, "lerobot_pf2mp.envs.handwriting.unitree_z1", raising=False)
+    message = r'^the robot unitree_z1 needs: pip install "lerobot_policy_pf2mp\[z1\]"$'
+    with pytest.raises(ConfigError, match=message):
+        PF2MPHandwritingEnv(robot="unitree_z1")
+    with pytest.raises(ImportError, match=message):
+        HandwritingEnv("pen", robot="unitree_z1")
 
 
 @pytest.mark.parametrize("task", ["HandwritingHand-v0", "joint", None, ""])

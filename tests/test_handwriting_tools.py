@@ -23,10 +23,13 @@ from lerobot_pf2mp.dataset_tools.handwriting.handwriting_recording import read_h
 from lerobot_pf2mp.dataset_tools.writing.attempts import successful
 from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory
 from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import DatasetSpec, write_dataset
-from lerobot_pf2mp.envs.handwriting.handwriting_env import CONTROLS, SPACES, START_SPREAD, HandwritingEnv
-from lerobot_pf2mp.envs.handwriting.panda import GRIP, HOME, JOINT_NAMES, PEN_TIP, make_panda
+from lerobot_pf2mp.envs.handwriting.handwriting_env import CONTROLS, SPACES, HandwritingEnv
+from lerobot_pf2mp.envs.handwriting.panda import ARM, GRIP, HOME, JOINT_NAMES
+from lerobot_pf2mp.envs.handwriting.pen import PEN_TIP
 from lerobot_pf2mp.envs.handwriting.sheet import SHEET_CENTRE, SHEET_SIDE
 from lerobot_pf2mp.envs.handwriting.stroke import distances
+from lerobot_pf2mp.envs.handwriting.writing_episode import START_SPREAD
+from lerobot_pf2mp.envs.handwriting.writing_model import make_writing_model
 from lerobot_pf2mp.envs.handwriting.writing_scene import make_writing_scene
 
 # Letters that are not held out for measurements: one with an inflection, with corners, closed, and one that crosses itself.
@@ -79,7 +82,7 @@ def kept(space: str) -> list[np.ndarray]:
 
 @cache
 def panda() -> tuple[mujoco.MjModel, mujoco.MjData]:
-    model = make_panda(np.zeros((8, 8, 3), np.uint8))
+    model = make_writing_model(ARM, np.zeros((8, 8, 3), np.uint8))
     return model, mujoco.MjData(model)
 
 
@@ -962,7 +965,7 @@ def test_joint_offsets_are_refused_for_a_recording_without_joints(tmp_path: Path
             with_value(PLACES, (3, 1), -0.17),
             {},
             r"the pen in episode 0 of .*others.json must lie on the sheet, .* x in \[0.34, 0.66\] and "
-            r"y in \[-0.16, 0.16\] m of its base; got \[.*, -0.17\]",
+            r"y in \[-0.16, 0.16\] m of the table's frame; got \[.*, -0.17\]",
         ),
         (1000 * PLACES, {}, r"the pen in episode 0 .* must lie on the sheet, .* got \[450"),
         (PLACES, {"n_steps": 1}, "n_steps must be at least 2, got 1"),

@@ -430,7 +430,7 @@ def test_the_sheet_ends_at_its_border() -> None:
 
 def test_the_first_position_off_the_sheet_is_named() -> None:
     places = np.array([[0.5, 0.0], [0.6, 0.17], [0.9, 0.0]])
-    with pytest.raises(ValueError, match=r"y in \[-0.16, 0.16\] m of its base; got \[0.6, 0.17\]"):
+    with pytest.raises(ValueError, match=r"y in \[-0.16, 0.16\] m of the table's frame; got \[0.6, 0.17\]"):
         check_on_sheet(places, "start")
 
 

@@ -28,6 +28,7 @@ def collect_handwriting(
     seed: int,
     overwrite: bool,
     image_width: int | None = None,
+    robot: str = "panda",
 ) -> tuple[int, Counter[str]]:
     """Collects successful, collision-free demonstrations of a scripted expert as a LeRobotDataset.
 
@@ -41,16 +42,18 @@ def collect_handwriting(
         seed: Seed of all random numbers.
         overwrite: Whether an existing dataset is replaced.
         image_width: Width of a camera's images [pixels]; their height is three quarters of it. None for no camera.
+        robot: The arm, one of `tasks.ROBOTS`.
 
     Returns:
         The number of episodes written, and the number of those left out, by reason.
 
     Raises:
         ValueError: If an argument breaks its rule, or the expert almost never succeeds.
+        ImportError: If the package with the arm's model is missing.
         FileExistsError: If `root` exists and `overwrite` is false.
     """
     check_n_steps(n_steps)
-    options, image_size = dict(scene_options), None
+    options, image_size = {**scene_options, "robot": robot}, None
     if image_width is not None:
         options |= {"render_mode": "rgb_array", "render_size": image_width}
         image_size = image_size_of(image_width)
@@ -61,7 +64,7 @@ def collect_handwriting(
     n_written, dropped = write_trajectories(
         successful((writer.demonstrate(number) for number in count()), failed),
         root=root,
-        spec=handwriting_spec(space, env.scene.name, repo_id, origin, n_steps, image_size),
+        spec=handwriting_spec(space, env.arm, env.scene.name, repo_id, origin, n_steps, image_size),
         n_steps=n_steps,
         collides=lambda _: False,  # checked when the environment drew it
         n_episodes=n_episodes,

@@ -90,7 +90,7 @@ def convert_handwriting(
         _usable(path, recordings, env, space, n_steps, left_out),
         root=root,
         spec=handwriting_spec(
-            space, env.scene.name, repo_id, f"Converted from {path.name} (handwriting).", n_steps
+            space, env.arm, env.scene.name, repo_id, f"Converted from {path.name} (handwriting).", n_steps
         ),
         n_steps=n_steps,
         collides=lambda _: False,  # already checked by _usable

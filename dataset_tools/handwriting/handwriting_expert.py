@@ -9,8 +9,9 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory
-from lerobot_pf2mp.envs.handwriting.handwriting_env import START_SPREAD, HandwritingEnv
+from lerobot_pf2mp.envs.handwriting.handwriting_env import HandwritingEnv
 from lerobot_pf2mp.envs.handwriting.stroke import evenly_spaced
+from lerobot_pf2mp.envs.handwriting.writing_episode import START_SPREAD
 from lerobot_pf2mp.envs.handwriting.writing_scene import is_on_sheet
 
 _SPACING = 0.001  # between the positions on a stroke [m]

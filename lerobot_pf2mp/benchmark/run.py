@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from lerobot.envs.configs import EnvConfig
 from tqdm import tqdm
 
 from lerobot_pf2mp.benchmark.evaluation import evaluate_all
@@ -151,21 +152,26 @@ def _refuse_other_checkpoints(rows: Sequence[EpisodeRow], jobs: Sequence[Job], o
             )
 
 
+def _settings_of(env: EnvConfig) -> dict[str, Any]:
+    """The settings of an environment on which episodes depend, without its task."""
+    settings = {k: v for k, v in asdict(env).items() if not k.startswith("features") and k != "task"}
+    return {"type": env.type, **settings}
+
+
 def _mark_episodes(output_dir: Path, spec: BenchmarkSpec) -> None:
     """Marks the folder as a benchmark over these episodes, so that a later call can only continue with the same ones."""
     mark = output_dir / "run.json"
     episodes = {
-        "env": {
-            "type": spec.env.type,
-            **{k: v for k, v in asdict(spec.env).items() if not k.startswith("features")},
-        },
+        "env": _settings_of(spec.env),
         **{name: getattr(spec, name) for name in ("n_episodes", "episode_seed", "batch_size", "device")},
     }
-    episodes["env"].pop("task")
     variants = spec.variants
     if mark.exists():
         found = _read_mark(mark)
-        if found["episodes"] != json.loads(json.dumps(episodes)):
+        # Settings that environments got later had their defaults.
+        if isinstance(found["episodes"].get("env"), dict):
+            found["episodes"]["env"] = {**_settings_of(type(spec.env)()), **found["episodes"]["env"]}
+        if json.loads(json.dumps(found["episodes"])) != json.loads(json.dumps(episodes)):
             raise ValueError(
                 f"{output_dir} holds a benchmark over other episodes ({found['episodes']}), got {episodes}: choose another "
                 "--output_dir"

@@ -18,6 +18,7 @@ from lerobot_pf2mp.envs.tasks import (
     MAZE_OF_TASK,
     MAZE_STEPS,
     OBS_TYPES,
+    ROBOTS,
     SO101_STEPS,
     SO101_TASK,
     SPACE_OF_TASK,
@@ -37,6 +38,7 @@ class CollectConfig(WritingConfig):
         pf2mp-collect --task=fetch_reach --scene.wall_size=[0.3,0.04,0.25] --root=data/high_wall
         pf2mp-collect --task=fetch_reach --expert=outputs/expert_reach --root=data/fetch_reach_ppo
         pf2mp-collect --task=handwriting_joint --letter=S --n_episodes=20 --root=data/handwriting_S
+        pf2mp-collect --task=handwriting_pen --robot=unitree_z1 --letter=S --root=data/handwriting_z1
         pf2mp-collect --task=handwriting_pen --scene_file=my_stroke.json --root=data/my_stroke
         pf2mp-collect --task=so101_fence --obs_type=pixels_agent_pos --image_width=96 --root=data/so101_fence
     """
@@ -58,6 +60,8 @@ class CollectConfig(WritingConfig):
     action_noise: float = 0.0
     # Mazes: your own map instead of the task's: rows of 0 (free) and 1 (wall) separated by "/".
     maze_map: str | None = None
+    # Handwriting: the arm, panda, or unitree_z1, which needs: pip install "lerobot_policy_pf2mp[z1]".
+    robot: str = "panda"
     # Fetch: scripted, or the folder of an expert that pf2mp-train-expert trained in the same scene.
     expert: str = "scripted"
     # Fetch: distance of the scripted expert to the wall: clear (2 to 5 cm) or hug (2 to 10 mm). SO-101: height of the cube
@@ -93,6 +97,10 @@ def _collect(config: CollectConfig) -> None:
         raise ValueError(f"obs_type must be one of {list(OBS_TYPES)}, got {config.obs_type!r}")
     if config.maze_map is not None and config.task not in MAZE_OF_TASK:
         raise ValueError(f"--maze_map is for mazes only, got {config.maze_map} for {config.task}")
+    if config.robot not in ROBOTS:
+        raise ValueError(f"robot must be one of {list(ROBOTS)}, got {config.robot!r}")
+    if config.robot != "panda" and config.task not in SPACE_OF_TASK:
+        raise ValueError(f"--robot is for handwriting only, got {config.robot} for {config.task}")
     if config.task in MAZE_OF_TASK:
         _collect_maze(config)
     elif config.task in FETCH_OF_TASK:
@@ -157,6 +165,7 @@ def _collect_handwriting(config: CollectConfig, space: str) -> None:
         scene_options=config.scene_options,
         image_width=_image_width(config),
         seed=config.seed,
+        robot=config.robot,
     )
     write_and_report(config, config.task, HANDWRITING_STEPS, write)
 

@@ -23,7 +23,7 @@ class WritingConfig:
     # Handwriting: largest number of restricted regions in the concave parts of the letter.
     n_regions: int = N_REGIONS
     # Handwriting: a JSON file with your own stroke and regions instead, {"stroke": [[x, y], ...], "regions":
-    # [{"centre": [x, y], "radius": r}, {"corners": [[x, y], ...]}]} [m], x forward and y left of the arm's base.
+    # [{"centre": [x, y], "radius": r}, {"corners": [[x, y], ...]}]} [m], x forward and y left of the Panda's base.
     scene_file: Path | None = None
 
     @property

@@ -28,3 +28,9 @@ HANDWRITING_STEPS = 64
 
 # The state of robot and environment, or the state of the robot and camera images.
 OBS_TYPES = ("state", "pixels_agent_pos")
+
+# What moves the arms that write.
+SIMULATORS = ("mujoco", "genesis")
+
+# The arms that write; each has a module of this name in `envs.handwriting`.
+ROBOTS = ("panda", "unitree_z1")

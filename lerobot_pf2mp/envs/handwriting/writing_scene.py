@@ -37,7 +37,7 @@ class WritingScene:
 
     Args:
         name: Name of the letter or the scene file, for titles and file names.
-        stroke: ``(N, 2)`` positions x, y of the pen in the frame of the robot's base [m], in the order of writing.
+        stroke: ``(N, 2)`` positions x, y of the pen in the table's frame [m], in the order of writing.
         regions: The restricted regions.
 
     Raises:
@@ -83,7 +83,7 @@ def check_on_sheet(positions: np.ndarray, name: str) -> None:
         outside = positions.reshape(-1, 2)[row]
         raise ValueError(
             f"{name} must lie on the sheet, where the arm reaches with an upright pen, x in [{low[0]:g}, {high[0]:g}] "
-            f"and y in [{low[1]:g}, {high[1]:g}] m of its base; got {np.round(outside, 4).tolist()}"
+            f"and y in [{low[1]:g}, {high[1]:g}] m of the table's frame; got {np.round(outside, 4).tolist()}"
             f"{f' in row {row}' if positions.ndim > 1 else ''}"
         )
 
@@ -145,7 +145,7 @@ def read_writing_scene(path: Path) -> WritingScene:
     """Reads the scene that a JSON file describes.
 
     Args:
-        path: A file ``{"stroke": [[x, y], ...], "regions": [...]}``, with positions in the frame of the robot's base [m] and
+        path: A file ``{"stroke": [[x, y], ...], "regions": [...]}``, with positions in the table's frame [m] and
             regions as for `region_of`.
 
     Raises:

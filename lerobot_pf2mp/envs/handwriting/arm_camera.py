@@ -12,35 +12,35 @@ import mujoco
 import numpy as np
 from gymnasium.envs.mujoco.mujoco_rendering import OffScreenViewer
 
+from lerobot_pf2mp.envs.handwriting.arm import Arm
 from lerobot_pf2mp.envs.handwriting.ink import Ink
-from lerobot_pf2mp.envs.handwriting.panda import ARM_GROUP
 from lerobot_pf2mp.envs.handwriting.sheet import SHEET_CENTRE
 from lerobot_pf2mp.envs.handwriting.stroke import evenly_spaced
+from lerobot_pf2mp.envs.handwriting.writing_model import ARM_GROUP
 from lerobot_pf2mp.envs.headless import rendering
 
-# lookat [m], distance [m], azimuth and elevation [degrees], and whether the arm is shown.
-CAMERAS = {
-    "arm": ((0.40, 0.0, 0.13), 1.02, 130.0, -34.0, True),
-    "top": ((*SHEET_CENTRE, 0.0), 0.42, 90.0, -89.9, False),
-}
+CAMERAS = ("arm", "top")
 
+_TOP = (*SHEET_CENTRE, 0.0), 0.42, 90.0, -89.9  # as the view of an arm
 _INK = np.array([0.05, 0.10, 0.45, 1.0], dtype=np.float32)
 _INK_WIDTH = 0.003  # [m]
 _INK_HEIGHT = 0.001  # above the table, so that it is visible on the sheet [m]
 _SPACING, _MAX_LINES = 0.003, 1000  # smallest length [m] and largest number of the line segments of the ink
 
 
-class PandaCamera:
+class ArmCamera:
     """Renders the arm, the sheet and the ink.
 
     Args:
-        model: A model from `make_panda`.
-        view: One of `CAMERAS`.
+        arm: The arm.
+        model: A model from `make_writing_model`.
+        view: One of `CAMERAS`: the arm from the side, or the sheet without the arm from above.
         image_size: Height and width [pixels].
     """
 
-    def __init__(self, model: mujoco.MjModel, view: str, image_size: tuple[int, int]) -> None:
-        self._model, self._view, self._image_size = model, CAMERAS[view], image_size
+    def __init__(self, arm: Arm, model: mujoco.MjModel, view: str, image_size: tuple[int, int]) -> None:
+        self._model, self._image_size = model, image_size
+        self._view, self._shows_arm = {"arm": (arm.view, True), "top": (_TOP, False)}[view]
         self._viewer: OffScreenViewer | None = None
 
     def render(self, data: mujoco.MjData, ink: Ink) -> np.ndarray:
@@ -73,8 +73,8 @@ class PandaCamera:
         viewer = OffScreenViewer(self._model, data, width, height, max_geom=2 * _MAX_LINES)
         viewer.vopt.sitegroup[:] = 0
         camera = viewer.cam
-        lookat, camera.distance, camera.azimuth, camera.elevation, shows_arm = self._view
-        viewer.vopt.geomgroup[ARM_GROUP] = shows_arm
+        lookat, camera.distance, camera.azimuth, camera.elevation = self._view
+        viewer.vopt.geomgroup[ARM_GROUP] = self._shows_arm
         camera.lookat[:] = lookat
         # Without this, a renderer that is not closed prints an error when Python exits.
         atexit.register(_close, weakref.ref(viewer))
