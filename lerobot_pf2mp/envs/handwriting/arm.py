@@ -10,12 +10,10 @@ from importlib import import_module
 import mujoco
 import numpy as np
 
+from lerobot_pf2mp.envs.offscreen_camera import View
 from lerobot_pf2mp.envs.tasks import ROBOTS
 
 _TOLERANCE = 1e-4  # by which positions may exceed their limits [rad; m]
-
-# lookat [m], distance [m], azimuth and elevation [degrees].
-View = tuple[tuple[float, float, float], float, float, float]
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-import atexit
 import math
-import weakref
 from itertools import pairwise
 
 import mujoco
@@ -17,11 +15,11 @@ from lerobot_pf2mp.envs.handwriting.ink import Ink
 from lerobot_pf2mp.envs.handwriting.sheet import SHEET_CENTRE
 from lerobot_pf2mp.envs.handwriting.stroke import evenly_spaced
 from lerobot_pf2mp.envs.handwriting.writing_model import ARM_GROUP
-from lerobot_pf2mp.envs.headless import rendering
+from lerobot_pf2mp.envs.offscreen_camera import OffscreenCamera, View
 
 CAMERAS = ("arm", "top")
 
-_TOP = (*SHEET_CENTRE, 0.0), 0.42, 90.0, -89.9  # as the view of an arm
+_TOP: View = ((*SHEET_CENTRE, 0.0), 0.42, 90.0, -89.9)
 _INK = np.array([0.05, 0.10, 0.45, 1.0], dtype=np.float32)
 _INK_WIDTH = 0.003  # [m]
 _INK_HEIGHT = 0.001  # above the table, so that it is visible on the sheet [m]
@@ -39,9 +37,12 @@ class ArmCamera:
     """
 
     def __init__(self, arm: Arm, model: mujoco.MjModel, view: str, image_size: tuple[int, int]) -> None:
-        self._model, self._image_size = model, image_size
-        self._view, self._shows_arm = {"arm": (arm.view, True), "top": (_TOP, False)}[view]
-        self._viewer: OffScreenViewer | None = None
+        place, shows_arm = {"arm": (arm.view, True), "top": (_TOP, False)}[view]
+
+        def prepare(viewer: OffScreenViewer) -> None:
+            viewer.vopt.geomgroup[ARM_GROUP] = shows_arm
+
+        self._camera = OffscreenCamera(model, place, image_size, prepare, max_geom=2 * _MAX_LINES)
 
     def render(self, data: mujoco.MjData, ink: Ink) -> np.ndarray:
         """Renders an image ``(H, W, 3)`` uint8.
@@ -53,32 +54,16 @@ class ArmCamera:
         Raises:
             RuntimeError: If this machine cannot render; the message says what to install.
         """
-        with rendering():
-            if self._viewer is None:
-                self._viewer = self._make_viewer(data)
-            self._viewer.make_context_current()
+
+        def mark(viewer: OffScreenViewer) -> None:
             for stroke in ink.strokes:
-                _add_ink(self._viewer, evenly_spaced(stroke, max(_SPACING, ink.length / _MAX_LINES)))
-            return self._viewer.render("rgb_array")
+                _add_ink(viewer, evenly_spaced(stroke, max(_SPACING, ink.length / _MAX_LINES)))
+
+        return self._camera.render(data, mark)
 
     def close(self) -> None:
         """Frees the renderer."""
-        if self._viewer is not None:
-            self._viewer.close()
-            self._viewer = None
-
-    def _make_viewer(self, data: mujoco.MjData) -> OffScreenViewer:
-        height, width = self._image_size
-        # Not MuJoCo's own renderer, because that chooses its OpenGL backend when MuJoCo is imported.
-        viewer = OffScreenViewer(self._model, data, width, height, max_geom=2 * _MAX_LINES)
-        viewer.vopt.sitegroup[:] = 0
-        camera = viewer.cam
-        lookat, camera.distance, camera.azimuth, camera.elevation = self._view
-        viewer.vopt.geomgroup[ARM_GROUP] = self._shows_arm
-        camera.lookat[:] = lookat
-        # Without this, a renderer that is not closed prints an error when Python exits.
-        atexit.register(_close, weakref.ref(viewer))
-        return viewer
+        self._camera.close()
 
 
 def _add_ink(viewer: OffScreenViewer, positions: np.ndarray) -> None:
@@ -93,9 +78,3 @@ def _add_ink(viewer: OffScreenViewer, positions: np.ndarray) -> None:
             mat=np.stack([up, np.cross(ahead, up), ahead], axis=1).ravel(),
             rgba=_INK,
         )
-
-
-def _close(viewer: weakref.ref[OffScreenViewer]) -> None:
-    alive = viewer()
-    if alive is not None:
-        alive.close()

@@ -18,7 +18,7 @@ from so101_nexus.objects import CubeObject
 from so101_nexus.scene import MUJOCO_SCENE_OPTION_XML
 
 from lerobot_pf2mp.envs.obstacle import Obstacle
-from lerobot_pf2mp.envs.so101.fence_camera import CAMERA, FenceCamera
+from lerobot_pf2mp.envs.so101.fence_camera import CAMERA, fence_camera
 from lerobot_pf2mp.envs.so101.fence_scene import (
     CUBE_SIZE,
     GOAL_RADIUS,
@@ -72,7 +72,7 @@ class FenceSimulation(SO101NexusMuJoCoBaseEnv):
         self.scene = make_scene(
             wall_position=wall_position, wall_size=wall_size, cube_range=cube_range, goal_range=goal_range
         )
-        self._has_camera = has_camera
+        self._has_camera, self._image_shape = has_camera, (image_size, image_size, 3)
         config = EnvironmentConfig(
             robot=RobotConfig(rest_qpos_deg=_HOME),
             observations=[],
@@ -87,8 +87,8 @@ class FenceSimulation(SO101NexusMuJoCoBaseEnv):
         self.model = copy.deepcopy(compiled)  # each episode changes it
         self.data = mujoco.MjData(self.model)
         self._set_target_geoms(self._cube.geom_ids)
-        self._camera = FenceCamera(self.model, CAMERA, "shapes", image_size)
-        self._film_camera = FenceCamera(self.model, "side", detail, render_size)
+        self._camera = fence_camera(self.model, CAMERA, "shapes", image_size)
+        self._film_camera = fence_camera(self.model, "side", detail, render_size)
         self._finish_model_setup()
         robot = self._robot_geoms()
         self.wall = Obstacle(self.model, self.data, "wall", [*robot, *self._cube.geom_ids])
@@ -163,7 +163,7 @@ class FenceSimulation(SO101NexusMuJoCoBaseEnv):
 
     def _build_observation_space(self) -> spaces.Space:
         joints = spaces.Box(-np.inf, np.inf, (len(self._joint_ids),), np.float32)
-        camera = {CAMERA: spaces.Box(0, 255, self._camera.image_shape, np.uint8)}
+        camera = {CAMERA: spaces.Box(0, 255, self._image_shape, np.uint8)}
         return spaces.Dict({"state": joints, **(camera if self._has_camera else {})})
 
     def _get_obs(self) -> Any:
