@@ -31,7 +31,7 @@ the wall. Every one has {n_steps} steps at {fps} Hz, and goes on after success.
 |---|---|---|
 | `observation.state` | position x, y, z of the hand, opening of the gripper | m, 0 to 1 |
 | `observation.environment_state` | positions x, y, z of object and goal, unless there is a camera | m |
-| `action` | displacement x, y, z of the hand's target, effort of the gripper; from -1 to 1 | cm, relative |
+| `action` | executed displacement x, y, z of the hand's target, effort of the gripper; from -1 to 1 | cm, relative |
 | `observation.image` | if present: the table | |
 
 The actions are displacements: train guided policies with `--policy.field_over=integrated`,

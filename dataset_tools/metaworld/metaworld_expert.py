@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from metaworld import policies
 
-from lerobot_pf2mp.envs.metaworld.metaworld_env import MetaWorldEnv
+from lerobot_pf2mp.envs.metaworld.metaworld_env import DISPLACEMENT, MetaWorldEnv
 
 _EXPERTS: dict[str, Any] = {
     "reach-wall-v3": policies.SawyerReachWallV3Policy,
@@ -25,7 +25,7 @@ class Attempt:
 
     Args:
         observations: The environment's observation before each action.
-        actions: ``(4,)`` the actions, in the environment's range.
+        actions: ``(4,)`` the actions that were executed.
         images: ``(H, W, 3)`` uint8, one for each action; empty if the environment does not render.
         is_success: Whether Meta-World says so after the last step.
         is_collision: Whether the robot or the object touched the wall.
@@ -55,7 +55,9 @@ class MetaWorldExpert:
     def demonstrate(self, number: int, n_steps: int) -> Attempt:
         """Demonstrates one episode of `n_steps` steps; `number` is part of its seed.
 
-        The expert's actions exceed the range of actions; the environment clips them, and what it executes is recorded.
+        The expert asks for more than the environment does: for displacements beyond the range of actions, and out of the
+        box of the hand's target. What the environment executes is recorded. It has the same effect, and its sum is the way
+        of the hand's target.
         """
         (seed,) = np.random.SeedSequence([self._seed, number]).generate_state(1)
         observation, info = self._env.reset(seed=int(seed))
@@ -68,8 +70,11 @@ class MetaWorldExpert:
                 warnings.simplefilter("ignore")  # that the environment clips its actions
                 action = self._policy.get_action(self._env.own_observation)
             attempt.observations.append(observation)
-            attempt.actions.append(action.astype(np.float32).clip(-1, 1))
-            observation, _, _, _, info = self._env.step(attempt.actions[-1])
+            before = self._env.hand_target
+            observation, _, _, _, info = self._env.step(action)
+            displacement = (self._env.hand_target - before) / DISPLACEMENT
+            executed = np.array([*displacement, action[3]]).clip(-1, 1)
+            attempt.actions.append(executed.astype(np.float32))
             if info["is_collision"]:
                 break
         attempt.is_success, attempt.is_collision = info["is_success"], info["is_collision"]

@@ -15,13 +15,17 @@ from lerobot_pf2mp.envs.metaworld.table_camera import TableCamera
 from lerobot_pf2mp.envs.metaworld.wall_tasks import WallTask
 from lerobot_pf2mp.envs.tasks import METAWORLD_TASKS
 
+# What an action of 1 moves the hand's target by [m], as Meta-World's tasks have it.
+DISPLACEMENT = 0.01
+
 
 class MetaWorldEnv(gym.Env):
     """A Sawyer arm that must reach a goal, or push an object or carry it there, without touching a wall.
 
     ## Description
     Meta-World's own environments (McLean et al., 2025), with one difference: contacts with the wall are reported. Actions
-    are displacements of the hand's target, whose running sum the hand follows with a lag of up to 8 cm.
+    are displacements of the hand's target, which the hand follows with a lag of up to 10 cm. The target stays in a box: a
+    displacement that leads out of it is cut.
 
     ## Action space
     ``Box(4)`` in [-1, 1]: displacement x, y, z of the hand's target [cm], and effort of the gripper.
@@ -88,6 +92,11 @@ class MetaWorldEnv(gym.Env):
         self.own_observation = np.zeros(39)
         self._is_running = self._is_collision = False
         self._path_length = 0.0
+
+    @property
+    def hand_target(self) -> np.ndarray:
+        """``(3,)`` the position to which the hand is pulled [m]."""
+        return self._wall_task.hand_target.copy()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -54,6 +54,11 @@ class WallTask:
         """``(3,)`` the goal [m]."""
         return self.sawyer._target_pos
 
+    @property
+    def hand_target(self) -> np.ndarray:
+        """``(3,)`` the position to which the hand is pulled [m]."""
+        return self.data.mocap_pos[0]
+
     def reset(self, positions: np.ndarray) -> np.ndarray:
         """Meta-World's observation ``(39,)`` at the start of an episode with these positions ``(6,)`` [m]."""
         self.sawyer._last_rand_vec = positions
