@@ -46,7 +46,17 @@ PACKAGES = (
     "accelerate",
 )
 ESSENTIAL = ("python", *PACKAGES, "discovery", "device", "simulation")
-OTHERS = ("lerobot-train", "extension", "rendering", "video", "experts", "async (grpc)", "peft", "wandb")
+OTHERS = (
+    "lerobot-train",
+    "extension",
+    "rendering",
+    "video",
+    "experts",
+    "metaworld",
+    "async (grpc)",
+    "peft",
+    "wandb",
+)
 # Trials that do not answer in time are as good as none, where only the rest matters.
 WITHOUT_TRIALS = "--time_limit=0.001"
 

@@ -54,6 +54,18 @@ def test_an_environment_keeps_gymnasiums_rules_and_is_reproducible(task):
     )
 
 
+@pytest.mark.parametrize("task", METAWORLD_TASKS)
+def test_the_wall_of_the_configuration_is_that_of_the_simulation(task):
+    task_of_meta_world, wall = MetaWorldEnv(task)._wall_task, PF2MPMetaWorldEnv(task=task).wall
+    task_of_meta_world.reset(task_of_meta_world.positions[0])
+    model, data = task_of_meta_world.model, task_of_meta_world.data
+    geoms = np.flatnonzero(model.geom_bodyid == model.body("wall").id)
+    assert len(geoms) == 2
+    for geom in geoms:
+        np.testing.assert_allclose(data.geom_xpos[geom], wall.centre)
+        np.testing.assert_allclose(2 * model.geom_size[geom], wall.size)
+
+
 def test_an_action_of_one_moves_the_hands_target_by_a_centimetre():
     env = MetaWorldEnv("reach-wall-v3")
     env.reset(seed=0)

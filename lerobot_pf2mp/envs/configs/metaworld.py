@@ -9,6 +9,7 @@ from typing import Any
 
 from lerobot.envs.configs import EnvConfig
 
+from lerobot_pf2mp.envs.box import Box
 from lerobot_pf2mp.envs.configs.collision_env import CollisionEnvConfig
 from lerobot_pf2mp.envs.image_size import image_size_of
 from lerobot_pf2mp.envs.tasks import (
@@ -57,6 +58,11 @@ class PF2MPMetaWorldEnv(CollisionEnvConfig):
         with reported_on_the_command_line():
             self._describe(4, 6, lambda: image_size_of(self.render_size))
         self.fps = METAWORLD_FPS
+
+    @property
+    def wall(self) -> Box:
+        """The wall [m], the same in all of these tasks."""
+        return Box((0.1, 0.75, 0.06), (0.24, 0.02, 0.12))
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:

@@ -21,7 +21,8 @@ class GuidedConfig:
     """The options of guidance (Section IV-B of the paper), to be mixed into the configuration of a policy.
 
     The field is a density over actions, so the actions it covers must be positions in the space that holds the
-    obstacles (ball, gripper or joint positions). A density over displacements says nothing about obstacles.
+    obstacles (ball, gripper or joint positions). A density over displacements says nothing about obstacles: of those, it is
+    one over their running sum (`field_over`).
 
     All values can be changed at evaluation, for example with ``--policy.guidance_scale=0.4``. Only `field_action_dims`,
     `field_over` and what belongs to it then need a new training, or pf2mp-fit-field.
