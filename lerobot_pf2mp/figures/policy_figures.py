@@ -133,8 +133,8 @@ class GuidedPolicyFigures:
         """
         if self._config.field_over == INTEGRATED and figure not in _OF_STATES:
             raise ValueError(
-                f"the figure of a policy with field_over=integrated must be one of {_OF_STATES}, got {figure}: its actions are "
-                "displacements"
+                f"the figure of a policy with field_over=integrated must be one of {_OF_STATES}, got {figure}: its actions "
+                "are displacements"
             )
         scene = self.scene()
         if figure == "density":
