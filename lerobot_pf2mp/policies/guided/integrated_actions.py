@@ -123,13 +123,13 @@ class IntegratedActions:
 
     Args:
         integration: How displacements become positions.
-        dims: The D action dimensions that are displacements of the field.
+        dims: ``(D,)`` int64, the action dimensions that are displacements of the field, on the device of the chunks.
         places: ``(B, D)`` where the robots are observed, p_0 [normalised positions].
         n_past: Number of a chunk's first actions that lie before the current step.
     """
 
     integration: Integration
-    dims: tuple[int, ...]
+    dims: Tensor
     places: Tensor
     n_past: int = 0
 
@@ -146,12 +146,12 @@ class IntegratedActions:
                 f"field_state_dims must be below the dimension {now.shape[-1]} of {OBS_STATE}, got {state_dims}"
             )
         places = now[:, list(state_dims)] * integration.start.to(now)
-        return cls(integration.to(places), dims, places)
+        return cls(integration.to(places), torch.tensor(dims, device=now.device), places)
 
     def begun(self, first: Tensor) -> Tensor:
         """First actions ``(B, A)`` with the places of the robots in place of displacements."""
         placed = _not_shortened(first).clone()
-        placed[:, list(self.dims)] = self.places.to(placed)
+        placed[:, self.dims] = self.places.to(placed)
         return placed
 
     def for_rows(self, rows: Tensor, n_each: int) -> IntegratedActions:
@@ -163,7 +163,7 @@ class IntegratedActions:
 
         Positions before the current step are those from which past displacements lead to p_0.
         """
-        integration, dims = self.integration, list(self.dims)
+        integration, dims = self.integration, self.dims
         placed = _not_shortened(chunk).clone()
         sums = (placed[..., dims] * integration.step + integration.rest).cumsum(dim=1)
         if self.n_past:
@@ -173,7 +173,7 @@ class IntegratedActions:
 
     def displacements(self, placed: Tensor) -> Tensor:
         """The inverse of `positions`, for chunks from the current step on ``(B, T, A)``."""
-        integration, dims = self.integration, list(self.dims)
+        integration, dims = self.integration, self.dims
         positions = placed[..., dims]
         steps = torch.diff(positions, dim=1, prepend=self.places.unsqueeze(1).to(positions))
         chunk = placed.clone()
@@ -186,7 +186,7 @@ class IntegratedActions:
         A displacement that is too large is cut, and the following ones catch up as far as they can. So what a robot would
         not execute is not planned. Chunks within the limits stay as they are.
         """
-        integration, dims = self.integration, list(self.dims)
+        integration, dims = self.integration, self.dims
         low, high = integration.low, integration.high
         slack = _ROUNDING * (high - low)
         given = _not_shortened(chunk)[..., dims]
@@ -220,7 +220,7 @@ class IntegratedGuide:
 
     def __call__(self, x_t: Tensor, x_next: Tensor, x_1: Tensor, dt: float) -> Tensor:
         """The guided step from the unguided one, all ``(B, T, A)`` [normalised displacements]."""
-        actions, dims = self.actions, list(self.actions.dims)
+        actions, dims = self.actions, self.actions.dims
         before = actions.positions(x_next)
         after = self.guide(actions.positions(x_t), before, actions.positions(x_1), dt)
         offsets = (after - before)[..., dims]  # (B, T, D)
