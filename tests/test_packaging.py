@@ -22,6 +22,7 @@ from packaging.utils import canonicalize_name
 
 from lerobot_pf2mp import DPPFConfig, PF2MPConfig, PF2MPFetchEnv, PF2MPHandwritingEnv, PF2MPMazeEnv
 from lerobot_pf2mp.commands.benchmark import BenchmarkConfig, make_spec
+from lerobot_pf2mp.envs.configs.metaworld import PF2MPMetaWorldEnv
 
 ROOT = Path(__file__).parents[1]
 
@@ -46,8 +47,13 @@ print("discovered")
 """
 
 
-HORIZONS = {"maze": 80, "fetch": 48, "handwriting": 64}
-ENVS = {"maze": PF2MPMazeEnv, "fetch": PF2MPFetchEnv, "handwriting": PF2MPHandwritingEnv}
+HORIZONS = {"maze": 80, "fetch": 48, "handwriting": 64, "metaworld": 112}
+ENVS = {
+    "maze": PF2MPMazeEnv,
+    "fetch": PF2MPFetchEnv,
+    "handwriting": PF2MPHandwritingEnv,
+    "metaworld": PF2MPMetaWorldEnv,
+}
 
 
 def test_distribution_name_is_one_that_lerobot_looks_for(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -94,6 +100,8 @@ def test_every_folder_of_code_is_packaged() -> None:
 def test_configuration_files_are_valid(path: Path) -> None:
     content = yaml.safe_load(path.read_text())
     assert f"--config_path={path.relative_to(ROOT)}" in path.read_text()  # the comment says how to use it
+    if "metaworld" in path.stem and not path.stem.startswith("train_"):
+        pytest.importorskip("metaworld", reason="needs the extra metaworld")
     if path.stem.startswith("train_"):
         config = draccus.parse(TrainPipelineConfig, path, args=[])
         (horizon,) = (steps for task, steps in HORIZONS.items() if task in path.stem)
