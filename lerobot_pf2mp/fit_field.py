@@ -27,10 +27,12 @@ from lerobot_pf2mp.field_report.of_dataset import report_on_dataset
 from lerobot_pf2mp.field_report.report import FieldReport
 from lerobot_pf2mp.loading import load_config, load_processors, save_processors
 from lerobot_pf2mp.policies.guarded.configuration_guarded import GuardedConfig
-from lerobot_pf2mp.policies.guided.action_kind import warn_unless_positions
+from lerobot_pf2mp.policies.guided.action_kind import warn_about_actions
 from lerobot_pf2mp.policies.guided.action_units import normalised_unit, normaliser_of, places_of_states
 from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
+from lerobot_pf2mp.policies.guided.field_settings import INTEGRATED
+from lerobot_pf2mp.policies.guided.integrated_dataset import observe_integrated_dataset
 from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
 from lerobot_pf2mp.policies.guided.relative_actions import refuse_relative_actions
 from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
@@ -98,7 +100,7 @@ def fit_field(
             preprocessor, postprocessor = load_processors(config, checkpoint, checkpoint_revision)
         refuse_relative_actions(preprocessor.steps)
         dataset = _load_dataset(repo_id, root, episodes, dataset_revision)
-        warn_unless_positions(dataset, guided.field_settings.action_dims)
+        warn_about_actions(dataset, guided.field_settings)
         step = _fitted_step(guided, dataset, preprocessor.steps)
         if report is not None:
             report(report_on_dataset(step.demonstrations, dataset, partial(_normalise, preprocessor.steps)))
@@ -165,6 +167,9 @@ def _normaliser_for(config: PreTrainedConfig, dataset: LeRobotDataset) -> Normal
             f"{list(dataset.meta.features)}"
         )
     config.output_features = {ACTION: PolicyFeature(FeatureType.ACTION, shape)}
+    if OBS_STATE in dataset.meta.features and OBS_STATE in dataset.meta.stats:
+        of_state = tuple(dataset.meta.features[OBS_STATE]["shape"])
+        config.input_features = {OBS_STATE: PolicyFeature(FeatureType.STATE, of_state)}
     return normaliser_of(config, cast(dict[str, Any], dataset.meta.stats))
 
 
@@ -214,6 +219,12 @@ def _fitted_step(
     unit, places = torch.ones(shape), torch.empty(0, 0)
     for normaliser in steps:
         if isinstance(normaliser, NormalizerProcessorStep):
+            if settings.over == INTEGRATED:
+                observe_integrated_dataset(
+                    step.demonstrations, dataset, config, normaliser, partial(_normalise, steps)
+                )
+                step.demonstrations.field()
+                return step
             unit, places = normalised_unit(normaliser, *shape), places_of_states(normaliser, *shape)
     frames = dataset.hf_dataset.with_format("numpy", columns=[ACTION, "index", "episode_index"])
     starts = range(0, len(frames), _FRAMES_AT_ONCE)

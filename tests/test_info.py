@@ -46,7 +46,7 @@ PACKAGES = (
     "accelerate",
 )
 ESSENTIAL = ("python", *PACKAGES, "discovery", "device", "simulation")
-EXTRAS_OF_OURS = ("experts", "async (grpc)", "so101", "peft", "wandb")
+EXTRAS_OF_OURS = ("experts", "metaworld", "async (grpc)", "so101", "peft", "wandb")
 OTHERS = ("lerobot-train", "extension", "rendering", "video", *EXTRAS_OF_OURS)
 # Trials that do not answer in time are as good as none, where only the rest matters.
 WITHOUT_TRIALS = "--time_limit=0.001"

@@ -23,6 +23,8 @@ from packaging.utils import canonicalize_name
 
 from lerobot_pf2mp import DPPFConfig, PF2MPConfig, PF2MPFetchEnv, PF2MPHandwritingEnv, PF2MPMazeEnv
 from lerobot_pf2mp.commands.benchmark import BenchmarkConfig, make_spec
+from lerobot_pf2mp.envs.configs.metaworld import PF2MPMetaWorldEnv
+from lerobot_pf2mp.envs.configs.so101 import PF2MPSO101Env
 
 ROOT = Path(__file__).parents[1]
 
@@ -47,8 +49,22 @@ print("discovered")
 """
 
 
-HORIZONS = {"maze": 80, "fetch": 48, "handwriting": 64, "panda_symbol": 64}
-ENVS = {"maze": PF2MPMazeEnv, "fetch": PF2MPFetchEnv, "handwriting": PF2MPHandwritingEnv}
+HORIZONS = {
+    "maze": 80,
+    "fetch": 48,
+    "handwriting": 64,
+    "panda_symbol": 64,
+    "metaworld": 112,
+    "so101_small": 96,
+    "so101_act": 48,
+}
+ENVS = {
+    "maze": PF2MPMazeEnv,
+    "fetch": PF2MPFetchEnv,
+    "handwriting": PF2MPHandwritingEnv,
+    "metaworld": PF2MPMetaWorldEnv,
+    "so101": PF2MPSO101Env,
+}
 
 
 def test_distribution_name_is_one_that_lerobot_looks_for(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -105,6 +121,8 @@ def test_configuration_files_are_valid(path: Path) -> None:
     content = yaml.safe_load(path.read_text())
     skip_without_its_extra(content.get("env", {}))
     assert f"--config_path={path.relative_to(ROOT)}" in path.read_text()  # the comment says how to use it
+    if "metaworld" in path.stem and not path.stem.startswith("train_"):
+        pytest.importorskip("metaworld", reason="needs the extra metaworld")
     if path.stem.startswith("train_"):
         config = draccus.parse(TrainPipelineConfig, path, args=[])
         (horizon,) = (steps for task, steps in HORIZONS.items() if task in path.stem)

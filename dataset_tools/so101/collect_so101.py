@@ -4,18 +4,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
 from contextlib import closing
-from itertools import count, islice
+from itertools import count
 from pathlib import Path
 
 import numpy as np
 
 from lerobot_pf2mp.dataset_tools.so101.fence_dataset import IMAGE_KEY, fence_spec
 from lerobot_pf2mp.dataset_tools.so101.fence_expert import STYLES, FenceRecording, ScriptedFenceExpert
-from lerobot_pf2mp.dataset_tools.writing.lerobot_writer import write_dataset
-from lerobot_pf2mp.dataset_tools.writing.video_writer import write_video_dataset
-from lerobot_pf2mp.dataset_tools.writing.write_trajectories import with_progress
+from lerobot_pf2mp.dataset_tools.writing.attempts import successful
+from lerobot_pf2mp.dataset_tools.writing.write_trajectories import write_episodes
 from lerobot_pf2mp.envs.so101.fence_env import SO101FenceEnv
 from lerobot_pf2mp.envs.tasks import SO101_STEPS
 
@@ -54,35 +52,34 @@ def collect_so101(
     """
     if style not in STYLES:
         raise ValueError(f"style must be one of {list(STYLES)}, got {style!r}")
-    if n_episodes < 1:
-        raise ValueError(f"n_episodes must be at least 1, got {n_episodes}")
     if n_steps != SO101_STEPS:
         raise ValueError(
             f"n_steps must be {SO101_STEPS} for so101_fence, which is not resampled, got {n_steps}"
         )
-    dropped: Counter[str] = Counter()
+    failed: Counter[str] = Counter()
     obs_type = "state" if image_width is None else "pixels_agent_pos"
     with closing(SO101FenceEnv(obs_type, image_size=image_width or 96)) as env:
         expert = ScriptedFenceExpert(env, style, seed)
-        usable = islice(_usable(map(expert.demonstrate, count()), dropped), n_episodes)
-        spec = fence_spec(repo_id, style, seed, image_width)
-        with closing(with_progress(usable, n_episodes)) as episodes:
-            write = write_dataset if image_width is None else write_video_dataset
-            n_written = write(root, spec, episodes, overwrite=overwrite)
-    return n_written, dropped
+        attempts = (_frames_of(expert.demonstrate(number)) for number in count())
+        n_written = write_episodes(
+            successful(attempts, failed),
+            root=root,
+            spec=fence_spec(repo_id, style, seed, image_width),
+            n_episodes=n_episodes,
+            overwrite=overwrite,
+        )
+    return n_written, failed
 
 
-def _usable(recordings: Iterator[FenceRecording], dropped: Counter[str]) -> Iterator[dict[str, np.ndarray]]:
-    """The frames of the successful, collision-free episodes."""
-    for recording in recordings:
-        if recording.info["is_collision"] or recording.info["is_table_contact"]:
-            dropped["in collision"] += 1
-        elif not recording.info["is_success"]:
-            dropped["without success"] += 1
-        else:
-            frames = {"observation.state": recording.states, "action": recording.actions}
-            if recording.images:
-                frames[IMAGE_KEY] = recording.images
-            else:
-                frames["observation.environment_state"] = recording.environment_states
-            yield {key: np.array(values) for key, values in frames.items()}
+def _frames_of(recording: FenceRecording) -> dict[str, np.ndarray] | str:
+    """The frames of an episode, or why it is no demonstration."""
+    if recording.info["is_collision"] or recording.info["is_table_contact"]:
+        return "in collision"
+    if not recording.info["is_success"]:
+        return "without success"
+    frames = {"observation.state": recording.states, "action": recording.actions}
+    if recording.images:
+        frames[IMAGE_KEY] = recording.images
+    else:
+        frames["observation.environment_state"] = recording.environment_states
+    return {key: np.array(values) for key, values in frames.items()}

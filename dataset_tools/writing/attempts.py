@@ -6,17 +6,15 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator
 
-from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory
-
 # With fewer successes in its first attempts, an expert would need too long.
 _N_FIRST_ATTEMPTS, _MIN_SUCCESSES = 200, 4
 
 
-def successful(attempts: Iterable[Trajectory | str], failed: Counter[str]) -> Iterator[Trajectory]:
+def successful[T](attempts: Iterable[T | str], failed: Counter[str]) -> Iterator[T]:
     """The attempts that succeeded.
 
     Args:
-        attempts: For each attempt its trajectory if it succeeded, otherwise the reason for the failure.
+        attempts: For each attempt its recording if it succeeded, otherwise the reason for the failure.
         failed: Counts the failures, by reason.
 
     Raises:

@@ -48,19 +48,43 @@ def write_trajectories(
         FileExistsError: If `root` exists and `overwrite` is false.
     """
     check_n_steps(n_steps)
-    if n_episodes is not None and n_episodes < 1:
-        raise ValueError(f"n_episodes must be at least 1, got {n_episodes}")
     dropped: Counter[str] = Counter()
     prepared = prepare(trajectories, n_steps, collides, dropped)
-    usable = islice(({key: frames[key] for key in spec.features} for frames in prepared), n_episodes)
-    # Closed here, not by the garbage collector, so that an interrupted bar is not drawn again at the end.
-    with closing(with_progress(usable, n_episodes or n_expected)) as episodes:
-        write = write_video_dataset if has_images(spec) else write_dataset
-        n_written = write(root, spec, episodes, overwrite=overwrite)
+    n_written = write_episodes(
+        prepared, root=root, spec=spec, n_episodes=n_episodes, n_expected=n_expected, overwrite=overwrite
+    )
     return n_written, dropped
 
 
-def with_progress(
+def write_episodes(
+    recorded: Iterable[dict[str, np.ndarray]],
+    *,
+    root: Path,
+    spec: DatasetSpec,
+    n_episodes: int | None = None,
+    n_expected: int | None = None,
+    overwrite: bool = False,
+) -> int:
+    """Writes the frames of episodes as they are, with a progress bar, and returns the number of episodes written.
+
+    Args:
+        recorded: For each episode its frames ``(T, ...)`` by feature, at least those that `spec` names.
+        root: The other arguments and the errors are those of `write_trajectories`.
+        spec: As there.
+        n_episodes: As there.
+        n_expected: As there.
+        overwrite: As there.
+    """
+    if n_episodes is not None and n_episodes < 1:
+        raise ValueError(f"n_episodes must be at least 1, got {n_episodes}")
+    named = islice(({key: frames[key] for key in spec.features} for frames in recorded), n_episodes)
+    # Closed here, not by the garbage collector, so that an interrupted bar is not drawn again at the end.
+    with closing(_with_progress(named, n_episodes or n_expected)) as episodes:
+        write = write_video_dataset if has_images(spec) else write_dataset
+        return write(root, spec, episodes, overwrite=overwrite)
+
+
+def _with_progress(
     episodes: Iterable[dict[str, np.ndarray]], total: int | None
 ) -> Generator[dict[str, np.ndarray]]:
     """The episodes, while a bar shows how many there were. `total` is their number, if it is known."""

@@ -38,6 +38,7 @@ def register_with_lerobot() -> None:
     import lerobot_pf2mp.envs.configs.fetch
     import lerobot_pf2mp.envs.configs.handwriting
     import lerobot_pf2mp.envs.configs.maze
+    import lerobot_pf2mp.envs.configs.metaworld
     import lerobot_pf2mp.envs.configs.so101
     import lerobot_pf2mp.policies.dppf.configuration_dppf
     import lerobot_pf2mp.policies.fmp.configuration_fmp
@@ -59,6 +60,11 @@ def register_gym_environments() -> None:
             "space",
             tasks.HANDWRITING_TASKS,
             tasks.HANDWRITING_STEPS,
+        ),
+        "metaworld.metaworld_env:MetaWorldEnv": (
+            "task",
+            {name: name for name in tasks.METAWORLD_TASKS},
+            tasks.METAWORLD_STEPS,
         ),
     }
     for env_class, (argument, names, max_episode_steps) in env_classes.items():

@@ -53,6 +53,7 @@ def _lines(path: str, trust: Sequence[str]) -> Iterator[Line]:
 
 def _field_lines(config: Any, preprocessor: Any) -> Iterator[Line]:
     from lerobot_pf2mp.loading import loaded_demonstrations, loaded_field
+    from lerobot_pf2mp.policies.guided.field_settings import INTEGRATED
 
     field, demonstrations = loaded_field(config, preprocessor), loaded_demonstrations(preprocessor)
     episodes = demonstrations.episodes
@@ -81,6 +82,13 @@ def _field_lines(config: Any, preprocessor: Any) -> Iterator[Line]:
         f"log density on the way above {threshold.log_density:.4g}, calibrated on {threshold.n_plans} demonstrated plans; "
         f"at most {100 * threshold.false_alarm_rate:.2g} % false alarms; {done}",
     )
+    if config.field_over == INTEGRATED:
+        yield Line(
+            "way of a plan",
+            "begins at the observed state, and goes along the running sum of the actions, "
+            f"{config.field_displacement_scale:g} units of state per unit of action",
+        )
+        return
     place = (
         "the observed state"
         if demonstrations.starts_at_state(config.field_settings)

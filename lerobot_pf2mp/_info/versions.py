@@ -31,6 +31,7 @@ PACKAGES = (
 # purpose: (package, the distribution that requires it, the extra with which it requires it)
 EXTRAS = {
     "experts": ("stable-baselines3", DISTRIBUTION, "experts"),
+    "metaworld": ("metaworld", DISTRIBUTION, "metaworld"),
     "async (grpc)": ("grpcio", DISTRIBUTION, "async"),
     "so101": ("so101-nexus", DISTRIBUTION, "so101"),
     "peft": ("peft", LEROBOT, "peft"),

@@ -17,6 +17,8 @@ from lerobot_pf2mp.envs.tasks import (
     HANDWRITING_STEPS,
     MAZE_OF_TASK,
     MAZE_STEPS,
+    METAWORLD_OF_TASK,
+    METAWORLD_STEPS,
     OBS_TYPES,
     ROBOTS,
     SO101_STEPS,
@@ -40,21 +42,22 @@ class CollectConfig(WritingConfig):
         pf2mp-collect --task=handwriting_joint --letter=S --n_episodes=20 --root=data/handwriting_S
         pf2mp-collect --task=handwriting_pen --robot=unitree_z1 --letter=S --root=data/handwriting_z1
         pf2mp-collect --task=handwriting_pen --scene_file=my_stroke.json --root=data/my_stroke
+        pf2mp-collect --task=metaworld_push_wall --root=data/metaworld_push_wall
         pf2mp-collect --task=so101_fence --obs_type=pixels_agent_pos --image_width=96 --root=data/so101_fence
     """
 
-    # Task to demonstrate: maze_umaze, maze_medium, maze_large, fetch_reach, fetch_push, handwriting_joint,
-    # handwriting_pen or so101_fence.
+    # Task to demonstrate: maze_umaze, maze_medium, maze_large, fetch_reach, fetch_push, handwriting_joint, handwriting_pen,
+    # metaworld_reach_wall, metaworld_push_wall, metaworld_pick_place_wall or so101_fence.
     task: str = "maze_large"
     # Folder of the dataset; by default where LeRobot keeps the datasets of your Hub account.
     root: Path | None = None
     # Name of the dataset, user/name; by default local/TASK.
     repo_id: str | None = None
     # Demonstrations to write; by default 4000 for a maze, 1000 for Fetch, 20 for handwriting_joint, 10 for
-    # handwriting_pen, 200 for so101_fence.
+    # handwriting_pen, 500 for Meta-World, 200 for so101_fence.
     n_episodes: int | None = None
-    # Steps that each demonstration is resampled to; by default 80 for a maze, 48 for Fetch, 64 for handwriting; always 96
-    # for so101_fence, which is not resampled.
+    # Steps that each demonstration is resampled to; by default 80 for a maze, 48 for Fetch, 64 for handwriting. In
+    # Meta-World, 112, and of so101_fence, 96, they are recorded as they are.
     n_steps: int | None = None
     # Mazes: standard deviation of the noise on the expert's force, relative to the largest force (100 N).
     action_noise: float = 0.0
@@ -107,10 +110,12 @@ def _collect(config: CollectConfig) -> None:
         _collect_fetch(config, FETCH_OF_TASK[config.task])
     elif config.task in SPACE_OF_TASK:
         _collect_handwriting(config, SPACE_OF_TASK[config.task])
+    elif config.task in METAWORLD_OF_TASK:
+        _collect_metaworld(config, METAWORLD_OF_TASK[config.task])
     elif config.task == SO101_TASK:
         _collect_so101(config)
     else:
-        tasks = [*MAZE_OF_TASK, *FETCH_OF_TASK, *SPACE_OF_TASK, SO101_TASK]
+        tasks = [*MAZE_OF_TASK, *FETCH_OF_TASK, *SPACE_OF_TASK, *METAWORLD_OF_TASK, SO101_TASK]
         raise ValueError(f"task must be one of {tasks}, got {config.task!r}")
 
 
@@ -168,6 +173,21 @@ def _collect_handwriting(config: CollectConfig, space: str) -> None:
         robot=config.robot,
     )
     write_and_report(config, config.task, HANDWRITING_STEPS, write)
+
+
+def _collect_metaworld(config: CollectConfig, task: str) -> None:
+    from lerobot_pf2mp.dataset_tools.metaworld.collect_metaworld import collect_metaworld
+
+    if config.expert != "scripted":
+        raise ValueError(f"expert must be scripted for Meta-World, got {config.expert!r}")
+    write = partial(
+        collect_metaworld,
+        task,
+        n_episodes=500 if config.n_episodes is None else config.n_episodes,
+        image_width=_image_width(config),
+        seed=config.seed,
+    )
+    write_and_report(config, config.task, METAWORLD_STEPS, write)
 
 
 def _collect_so101(config: CollectConfig) -> None:

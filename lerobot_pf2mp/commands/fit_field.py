@@ -51,6 +51,12 @@ class FitFieldPolicyConfig:
     field_angle_dims: tuple[int, ...] | None = None
     # Period of the angles in the dataset's units [rad; 360 for degrees].
     field_angle_period: float | None = None
+    # What the field is over: actions, which must be positions, or integrated, for displacements of the end effector.
+    field_over: str | None = None
+    # For integrated: what an action of 1 displaces the end effector by, in units of observation.state per unit of action.
+    field_displacement_scale: float | None = None
+    # For integrated: dimensions of observation.state that are the end effector's position; by default the first ones.
+    field_state_dims: tuple[int, ...] | None = None
 
 
 @dataclass

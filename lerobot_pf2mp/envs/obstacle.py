@@ -19,11 +19,13 @@ class Obstacle:
     Args:
         model: The MuJoCo model.
         data: Its state.
-        geom: Name of the obstacle's geom.
+        geom: Name or id of the obstacle's geom.
         movers: Ids of the geoms that must not touch it.
     """
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, geom: str, movers: Sequence[int]) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, data: mujoco.MjData, geom: str | int, movers: Sequence[int]
+    ) -> None:
         self._model, self._data = model, data
         self._geom = model.geom(geom).id
         self._movers = list(movers)

@@ -8,6 +8,12 @@ Plain tables, for modules that must not import LeRobot or MuJoCo.
 MAZE_TASKS = {"MazeUMaze-v0": "umaze", "MazeMedium-v0": "medium", "MazeLarge-v0": "large"}
 FETCH_TASKS = {"FetchReachWall-v0": "reach", "FetchPushWall-v0": "push"}
 HANDWRITING_TASKS = {"HandwritingJoint-v0": "joint", "HandwritingPen-v0": "pen"}
+# Keys: Meta-World's own names, also for Gymnasium and --env.task. Values: the task in words.
+METAWORLD_TASKS = {
+    "reach-wall-v3": "Move the gripper over the wall to the goal without touching the wall.",
+    "push-wall-v3": "Push the puck around the wall to the goal without touching the wall.",
+    "pick-place-wall-v3": "Carry the puck over the wall to the goal without touching the wall.",
+}
 
 # Keys: the names for Gymnasium. The second one is what so101-nexus' robot drives, for as long as it likes.
 SO101_STEPS = 96
@@ -21,10 +27,19 @@ MAZE_OF_TASK = {"maze_umaze": "umaze", "maze_medium": "medium", "maze_large": "l
 FETCH_OF_TASK = {"fetch_reach": "reach", "fetch_push": "push"}
 SO101_TASK = "so101_fence"
 SPACE_OF_TASK = {"handwriting_joint": "joint", "handwriting_pen": "pen"}
+METAWORLD_OF_TASK = {
+    "metaworld_reach_wall": "reach-wall-v3",
+    "metaworld_push_wall": "push-wall-v3",
+    "metaworld_pick_place_wall": "pick-place-wall-v3",
+}
 
 MAZE_STEPS = 80
 FETCH_STEPS = 48
 HANDWRITING_STEPS = 64
+METAWORLD_STEPS = 112
+METAWORLD_MOST_STEPS = 500  # Meta-World's own limit
+METAWORLD_FPS = 80
+METAWORLD_MISSING = 'the Meta-World tasks need: pip install "lerobot_policy_pf2mp[metaworld]"'
 
 # The state of robot and environment, or the state of the robot and camera images.
 OBS_TYPES = ("state", "pixels_agent_pos")

@@ -17,6 +17,7 @@ from lerobot_pf2mp.field_report.examination import Frames, make_field_report
 from lerobot_pf2mp.field_report.report import FieldReport
 from lerobot_pf2mp.policies.guided.action_kind import action_kind_of
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
+from lerobot_pf2mp.policies.guided.field_settings import INTEGRATED
 
 _MOST_FRAMES = 200_000  # that are looked at; of a larger dataset, every second, third, ... frame
 _FRAMES_AT_ONCE = 65536
@@ -33,13 +34,16 @@ def report_on_dataset(
         normalise: Normalises actions ``(N, A)`` as those of the sample.
     """
     dims = demonstrations.settings.action_dims
+    source, names = f"dataset {dataset.repo_id}", _names_of(dataset.meta.features[ACTION].get("names"))
+    if demonstrations.settings.over == INTEGRATED:  # positions of the sample: the dataset holds displacements
+        return make_field_report(demonstrations, source=source, names=names)
     frames = _read(dataset, normalise)
     actions = frames.actions if dims is None else frames.actions[:, list(dims)]
     return make_field_report(
         demonstrations,
-        source=f"dataset {dataset.repo_id}",
+        source=source,
         frames=frames._replace(actions=actions),
-        names=_names_of(dataset.meta.features[ACTION].get("names")),
+        names=names,
         action_kind=action_kind_of(dataset, dims),
     )
 

@@ -24,6 +24,7 @@ from lerobot_pf2mp.benchmark.prior_noise import seeded_prior_noise
 from lerobot_pf2mp.envs.configs.fetch import PF2MPFetchEnv
 from lerobot_pf2mp.envs.configs.handwriting import PF2MPHandwritingEnv
 from lerobot_pf2mp.envs.configs.maze import PF2MPMazeEnv
+from lerobot_pf2mp.envs.configs.metaworld import PF2MPMetaWorldEnv
 from lerobot_pf2mp.envs.maze.point_maze import parse_maze_map
 from lerobot_pf2mp.envs.tasks import MAZE_TASKS
 from lerobot_pf2mp.field_report.examination import make_field_report
@@ -33,10 +34,14 @@ from lerobot_pf2mp.figures.support import plot_support
 from lerobot_pf2mp.loading import load_policy, loaded_demonstrations
 from lerobot_pf2mp.policies.batch_keys import POTENTIAL_FIELD
 from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
+from lerobot_pf2mp.policies.guided.field_settings import INTEGRATED
 from lerobot_pf2mp.results.rows import SummaryRow, read_rows
 from lerobot_pf2mp.results.summary import group_cells
 
 FIGURES = ("lambda", "density", "arrows", "trajectories", "overview", "strokes", "flow", "video", "support")
+
+# Figures of what robots do, not of the field.
+_OF_STATES = ("trajectories", "video")
 
 _N_SEARCHED = 100  # episodes among which the clearest ones are chosen
 
@@ -126,6 +131,11 @@ class GuidedPolicyFigures:
         Raises:
             ValueError: If the figure cannot be drawn of this policy in this environment.
         """
+        if self._config.field_over == INTEGRATED and figure not in _OF_STATES:
+            raise ValueError(
+                f"the figure of a policy with field_over=integrated must be one of {_OF_STATES}, got {figure}: its actions "
+                "are displacements"
+            )
         scene = self.scene()
         if figure == "density":
             figures.plot_density(output, scene=scene, background=background)
@@ -168,7 +178,8 @@ class GuidedPolicyFigures:
             return Scene(self._postprocess, field, parse_maze_map(env.maze_map or MAZE_TASKS[str(env.task)]))
         if isinstance(env, PF2MPHandwritingEnv):
             return Scene(self._postprocess, field, writing=env.scene)
-        return Scene(self._postprocess, field, obstacles=[env.wall] if isinstance(env, PF2MPFetchEnv) else ())
+        has_wall = isinstance(env, PF2MPFetchEnv | PF2MPMetaWorldEnv)
+        return Scene(self._postprocess, field, obstacles=[env.wall] if has_wall else ())
 
     def path_pairs(self, n_pairs: int, episodes: Sequence[int] = ()) -> list[PathPair]:
         """Runs episodes without and with guidance, from the same start and prior noise.
@@ -293,6 +304,8 @@ class GuidedPolicyFigures:
         ]
         has_goals = OBS_ENV_STATE in observations
         goals = [observations[OBS_ENV_STATE][i, 0].numpy() if has_goals else None for i in range(n_episodes)]
+        if isinstance(self._env, PF2MPMetaWorldEnv):  # the object comes first, and is not the goal
+            goals = [None if goal is None else goal[3:] for goal in goals]
         return paths, goals
 
 

@@ -48,6 +48,8 @@ class GuidanceFacts:
         max_plans: Largest number of plans that are drawn for one that is executed.
         on_unsupported: What happens if the best of them leaves the demonstrated region.
         plans: How plans are calibrated; None if they are not.
+        displacement_scale: Of a field over integrated displacements, units of state per unit of action; None for a field
+            over actions.
     """
 
     scale: float
@@ -63,6 +65,7 @@ class GuidanceFacts:
     max_plans: int = 1
     on_unsupported: str = "ignore"
     plans: PlanFacts | None = None
+    displacement_scale: float | None = None
 
 
 @dataclass(frozen=True)

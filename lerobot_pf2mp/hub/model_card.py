@@ -201,8 +201,16 @@ def _describe_guidance(guidance: GuidanceFacts) -> list[tuple[str, str]]:
         ("bandwidth h", f"{guidance.bandwidth:.4g} [normalised action units]{rule}"),
         ("anchors M", f"{guidance.n_anchors} demonstrated actions"),
         ("action dimensions of the field", ", ".join(map(str, guidance.action_dims))),
+        *_describe_displacements(guidance),
         ("distance term alpha", f"{guidance.alpha:g}"),
     ]
+
+
+def _describe_displacements(guidance: GuidanceFacts) -> list[tuple[str, str]]:
+    if guidance.displacement_scale is None:
+        return []
+    scale = f"{guidance.displacement_scale:g} units of state per unit of action"
+    return [("the field is over", f"the running sum of displacements from the observed state, {scale}")]
 
 
 def _describe_region(guidance: GuidanceFacts) -> str:

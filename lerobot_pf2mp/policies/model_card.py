@@ -14,6 +14,7 @@ from lerobot_pf2mp.hub.model_card import env_options, make_model_card
 from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
 from lerobot_pf2mp.policies.guided.field_guidance import FieldGuidance
+from lerobot_pf2mp.policies.guided.field_settings import INTEGRATED
 
 
 class WithModelCard:
@@ -124,4 +125,5 @@ def _guidance_facts(
         max_plans=config.max_plans,
         on_unsupported=config.on_unsupported,
         plans=plans,
+        displacement_scale=config.field_displacement_scale if config.field_over == INTEGRATED else None,
     )

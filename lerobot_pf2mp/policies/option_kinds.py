@@ -17,6 +17,7 @@ LARGEST: dict[str, int] = {
     "down_dims": 65_536,
     "field_action_dims": 100_000,
     "field_angle_dims": 100_000,
+    "field_state_dims": 100_000,
     "horizon": 10_000,
     "kernel_size": 1001,
     "max_plans": 1000,

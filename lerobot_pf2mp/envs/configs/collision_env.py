@@ -72,7 +72,7 @@ class CollisionEnvConfig(EnvConfig):
         """Sets `features`.
 
         Args:
-            action_dim: Dimension of the action. The robot's state has the same one, because actions are positions.
+            action_dim: Dimension of the action, and of the robot's state.
             environment_dim: Dimension of the environment's state; 0 without one.
             image_size: Height and width of rendered images [pixels].
 

@@ -13,6 +13,7 @@ from lerobot_pf2mp.policies.checked_loading import require_own_config
 from lerobot_pf2mp.policies.dppf.configuration_dppf import DPPFConfig
 from lerobot_pf2mp.policies.guided.field_guidance import FieldGuidance
 from lerobot_pf2mp.policies.guided.guided_scheduler import guided_scheduler
+from lerobot_pf2mp.policies.guided.integrated_actions import guide_for_rows
 from lerobot_pf2mp.policies.image_sizes import check_image_sizes
 from lerobot_pf2mp.policies.own_policy import OwnPolicy
 from lerobot_pf2mp.policies.plans.plans import Plans
@@ -80,7 +81,7 @@ class DPPFPolicy(OwnPolicy, DiffusionPolicy):
 
         def draw_more(rows: Tensor, n: int) -> Tensor:
             observations = self._observations_of(window, rows, n)
-            with guided_scheduler(self.diffusion, guide):
+            with guided_scheduler(self.diffusion, guide_for_rows(guide, rows, n)):
                 return self.diffusion.generate_actions(observations)
 
         return self.guidance.choose(batch, chunk, draw_more)

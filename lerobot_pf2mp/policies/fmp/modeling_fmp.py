@@ -19,6 +19,7 @@ from lerobot_pf2mp.policies.fmp.configuration_fmp import FMPConfig
 from lerobot_pf2mp.policies.fmp.ema import MovingAverage
 from lerobot_pf2mp.policies.fmp.networks import VelocityNetwork
 from lerobot_pf2mp.policies.fmp.real_time_chunking import continuing
+from lerobot_pf2mp.policies.guided.integrated_actions import guide_for_rows
 from lerobot_pf2mp.policies.image_sizes import check_image_sizes
 from lerobot_pf2mp.policies.own_policy import OwnPolicy
 from lerobot_pf2mp.policies.plans.plans import require_finite
@@ -243,7 +244,7 @@ class FMPPolicy(OwnPolicy, PreTrainedPolicy):
                 noise.to(device=condition.device, dtype=torch.float32),
                 self.config.num_inference_steps,
                 integrator=self.config.integrator,
-                guide=guide,
+                guide=guide if rows is None else guide_for_rows(guide, rows, n_each),
                 steer=steer,
             )  # (B, T, A)
             return chunk[:, start:end]

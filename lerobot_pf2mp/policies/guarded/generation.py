@@ -23,6 +23,7 @@ from torch import Tensor
 
 from lerobot_pf2mp.flow_matching import Guide
 from lerobot_pf2mp.policies.guided.guided_scheduler import guided_scheduler
+from lerobot_pf2mp.policies.guided.integrated_actions import guide_from_now_on
 
 # Steps of guidance on a finished chunk. With ACT on the large maze and Fetch reach, two leave as few collisions as ten.
 N_STEPS_AT_THE_END = 2
@@ -88,7 +89,7 @@ class AtTheEnd:
         """The chunk after `N_STEPS_AT_THE_END` steps of guidance, in which no flow moves it."""
         if guide is None:
             return chunk
-        x = chunk.float()
+        x, guide = chunk.float(), guide_from_now_on(guide)
         for _ in range(N_STEPS_AT_THE_END):
             x = guide(x, x, x, 1 / N_STEPS_AT_THE_END)
         return x.to(chunk.dtype)

@@ -23,6 +23,7 @@ from lerobot_pf2mp.policies.guarded.configuration_guarded import GuardedConfig
 from lerobot_pf2mp.policies.guarded.generation import KNOWN_AT_THE_END, AtTheEnd, generation_of, replaced
 from lerobot_pf2mp.policies.guarded.repeated_rows import repeated_queues, repeated_rows
 from lerobot_pf2mp.policies.guided.field_guidance import FieldGuidance
+from lerobot_pf2mp.policies.guided.integrated_actions import guide_for_rows
 from lerobot_pf2mp.policies.own_policy import OwnPolicy
 from lerobot_pf2mp.policies.plans.plans import Plans
 
@@ -197,7 +198,7 @@ class GuardedPolicy(OwnPolicy, PreTrainedPolicy):
         generation = generation_of(self.base, kwargs.get("num_steps"))
         generate, n_executed = self._selecting or (self.base.predict_action_chunk, None)
 
-        def draw(inputs: dict[str, Any], *args: Any, **kwargs: Any) -> Tensor:
+        def draw(inputs: dict[str, Any], *args: Any, guide: Guide | None = guide, **kwargs: Any) -> Tensor:
             with generation.guided(guide):
                 chunk = generate(dict(inputs), *args, **kwargs)  # some policies write into their batch
             if self._is_time_first:
@@ -215,7 +216,11 @@ class GuardedPolicy(OwnPolicy, PreTrainedPolicy):
                 if isinstance(left_over, Tensor) and left_over.ndim == 2:
                     others["prev_chunk_left_over"] = left_over.unsqueeze(0)  # it has no row for each robot
                 with repeated_queues(self.base, *selection):
-                    plans = draw(repeated_rows(inputs, *selection), **repeated_rows(others, *selection))
+                    plans = draw(
+                        repeated_rows(inputs, *selection),
+                        guide=guide_for_rows(guide, rows, n_each),
+                        **repeated_rows(others, *selection),
+                    )
             else:
                 plans = torch.cat([draw(inputs, **others)[rows].unsqueeze(1) for _ in range(n_each)], dim=1)
                 plans = plans.flatten(0, 1)

@@ -10,11 +10,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.utils.constants import ACTION, OBS_STATE
+from lerobot.utils.constants import OBS_STATE
+
+from lerobot_pf2mp.policies.guided.displacement_scale import warn_unless_displacements
+from lerobot_pf2mp.policies.guided.field_settings import INTEGRATED, FieldSettings
+from lerobot_pf2mp.policies.guided.whole_episodes import read_whole_episodes
 
 logger = logging.getLogger(__name__)
 
@@ -27,7 +30,6 @@ _LARGEST_LEAD = 5
 # A dimension is constant if this share of its values is the same.
 _CONSTANT_SHARE = 0.99
 
-_N_FRAMES = 20_000  # that are compared, in whole episodes
 _FEWEST_FRAMES = 10
 
 
@@ -86,12 +88,25 @@ def action_kind_of(dataset: LeRobotDataset, dims: Sequence[int] | None) -> Actio
     Returns:
         The correlations; None if they cannot be told, or ``observation.state`` has other dimensions than the action.
     """
-    columns = _read(dataset)
-    if columns is None:
+    columns = read_whole_episodes(dataset)
+    if columns is None or columns[0].shape[1] != columns[1].shape[1]:
         return None
     actions, states, episodes = columns
     chosen = list(range(actions.shape[1]) if dims is None else dims)
     return check_positions(actions[:, chosen], states[:, chosen], episodes)
+
+
+def warn_about_actions(dataset: LeRobotDataset, settings: FieldSettings) -> None:
+    """Warns in one line if a dataset's actions are not what a field is over.
+
+    Args:
+        dataset: The dataset, with the episodes that the field is fitted to.
+        settings: The settings of the field.
+    """
+    if settings.over == INTEGRATED:
+        warn_unless_displacements(dataset, settings)
+    else:
+        warn_unless_positions(dataset, settings.action_dims)
 
 
 def warn_unless_positions(dataset: LeRobotDataset, dims: Sequence[int] | None) -> None:
@@ -105,7 +120,7 @@ def warn_unless_positions(dataset: LeRobotDataset, dims: Sequence[int] | None) -
             "The dataset's actions do not look like absolute positions: their rank correlation is %.2f with %s, and %.2f "
             "with its change to the next frame. Displacements, velocities and torques are the same everywhere, so a "
             "potential field over them says nothing about obstacles. Record the positions to which the robot is sent as "
-            "actions.",
+            "actions, or, if they are displacements of the end effector, train with --policy.field_over=integrated.",
             kind.with_states,
             OBS_STATE,
             kind.with_changes,
@@ -144,26 +159,3 @@ def _ranks(values: np.ndarray) -> np.ndarray:
 def _cosine(first: np.ndarray, second: np.ndarray) -> float:
     norms = float(np.linalg.norm(first) * np.linalg.norm(second))
     return float(first @ second) / norms if norms > 0 else 0.0
-
-
-def _read(dataset: LeRobotDataset) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Actions ``(N, A)``, states ``(N, A)`` and episode numbers ``(N,)`` of whole episodes spread over the dataset."""
-    shapes: list[Any] = [
-        tuple(dataset.meta.features.get(key, {}).get("shape", ())) for key in (ACTION, OBS_STATE)
-    ]
-    if shapes[0] != shapes[1] or len(shapes[0]) != 1 or not len(dataset.hf_dataset):
-        return None
-    table = dataset.hf_dataset.with_format("numpy", columns=[ACTION, OBS_STATE, "episode_index"])
-    episodes = np.asarray(table.with_format("numpy", columns=["episode_index"])[:]["episode_index"]).reshape(
-        -1
-    )
-    bounds = np.flatnonzero(np.diff(episodes, prepend=-1, append=-1))
-    n_episodes = len(bounds) - 1
-    n_chosen = max(1, min(n_episodes, n_episodes * _N_FRAMES // len(episodes)))
-    chosen = np.unique(np.linspace(0, n_episodes - 1, n_chosen).round().astype(int))
-    parts = [table[bounds[i] : min(bounds[i + 1], bounds[i] + _N_FRAMES)] for i in chosen.tolist()]
-    actions, states = (
-        np.concatenate([np.asarray(part[key], dtype=np.float64).reshape(-1, *shapes[0]) for part in parts])
-        for key in (ACTION, OBS_STATE)
-    )
-    return actions, states, np.concatenate([part["episode_index"].reshape(-1) for part in parts])

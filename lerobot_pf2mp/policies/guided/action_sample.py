@@ -8,6 +8,10 @@ from torch import Tensor
 
 from lerobot_pf2mp.policies.guided.frame_ranks import frame_of, rank_of
 
+# Frame numbers are below this. Of the actions of a chunk that are points of their own, though their frame has others in
+# other chunks, the number counts this often how far the action lies in its chunk.
+_IN_CHUNK = 2**40
+
 # Largest difference of an action that is read again, relative to 1 and to the action, that is rounding.
 _SAME_ACTION = 1e-4
 
@@ -47,8 +51,8 @@ class ActionSample:
 
     @property
     def frames(self) -> Tensor:
-        """``(P,)`` int64 indices of the frames in the dataset."""
-        return frame_of(self.ranks.cpu())
+        """``(P,)`` int64 indices in the dataset of the frames of the actions."""
+        return frame_of(self.ranks.cpu()) % _IN_CHUNK
 
     def candidates(
         self,
@@ -74,6 +78,25 @@ class ActionSample:
         if len(self) >= n_points:
             keep = keep & (ranks <= self.ranks[n_points - 1].to(ranks.device))
         return ActionSample(ranks[keep], actions[keep], episodes[keep])
+
+    @staticmethod
+    def each_by_itself(
+        actions: Tensor, is_pad: Tensor | None, frames: Tensor | None, episodes: Tensor | None
+    ) -> tuple[Tensor, Tensor | None, Tensor | None, Tensor | None]:
+        """The actions of chunks as chunks of one action, with numbers by which a frame has one point for each chunk.
+
+        Integrated actions depend on where their chunk begins. Arguments as for `DemonstratedActions.observe`.
+        """
+        n_steps = actions.shape[1]
+        steps = torch.arange(n_steps, device=actions.device)
+        return (
+            actions.flatten(0, 1).unsqueeze(1),
+            None if is_pad is None else is_pad.flatten().unsqueeze(1),
+            None
+            if frames is None
+            else (frames.to(actions.device).reshape(-1, 1) + steps * (1 + _IN_CHUNK)).flatten(),
+            None if episodes is None else episodes.reshape(-1).repeat_interleave(n_steps),
+        )
 
     def contradicts(self, other: ActionSample) -> bool:
         """Whether some frames of both have other actions."""

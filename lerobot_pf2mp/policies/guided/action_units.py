@@ -13,6 +13,29 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
 
+def affine_of(normaliser: NormalizerProcessorStep, key: str, dim: int | None = None) -> Tensor:
+    """How a step normalises an action or an observation: LeRobot's normalisations are affine in each dimension.
+
+    Args:
+        normaliser: The normalising step of a preprocessor.
+        key: ``action``, or the name of an observation.
+        dim: The number of its dimensions D; None for that of its feature.
+
+    Returns:
+        ``(2, D)`` float64 factors and offsets, on the CPU.
+    """
+    size = normaliser.features[key].shape[0] if dim is None else dim
+    ends = torch.stack([torch.zeros(size), torch.ones(size)])
+    transition: Any = (
+        {TransitionKey.ACTION: ends} if key == ACTION else {TransitionKey.OBSERVATION: {key: ends}}
+    )
+    done = normaliser(transition)
+    zero, one = (
+        (done[TransitionKey.ACTION] if key == ACTION else done[TransitionKey.OBSERVATION][key]).cpu().double()
+    )
+    return torch.stack([one - zero, zero])
+
+
 def normalised_unit(normaliser: NormalizerProcessorStep, action_dim: int) -> Tensor:
     """What a change of the recorded actions by 1 is in normalised actions, for each dimension.
 

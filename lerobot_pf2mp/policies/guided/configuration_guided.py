@@ -8,7 +8,7 @@ from typing import Any
 from lerobot.configs import PolicyFeature
 
 from lerobot_pf2mp.guidance import GuidanceSettings
-from lerobot_pf2mp.policies.guided.field_settings import FieldSettings
+from lerobot_pf2mp.policies.guided.field_settings import INTEGRATED, FieldSettings
 from lerobot_pf2mp.policies.plans.plans import ON_UNSUPPORTED
 
 # Policies read their settings for every chunk. The caches create and validate equal settings only once.
@@ -21,10 +21,11 @@ class GuidedConfig:
     """The options of guidance (Section IV-B of the paper), to be mixed into the configuration of a policy.
 
     The field is a density over actions, so the actions it covers must be positions in the space that holds the
-    obstacles (ball, gripper or joint positions). A density over displacements says nothing about obstacles.
+    obstacles (ball, gripper or joint positions). A density over displacements says nothing about obstacles: of those, it is
+    one over their running sum (`field_over`).
 
-    All values can be changed at evaluation, for example with ``--policy.guidance_scale=0.4``. Only `field_action_dims` then
-    needs a new training.
+    All values can be changed at evaluation, for example with ``--policy.guidance_scale=0.4``. Only `field_action_dims`,
+    `field_over` and what belongs to it then need a new training, or pf2mp-fit-field.
 
     Args:
         guidance_scale: lambda, the strength of the guidance; 0 with max_plans=1 is exactly the unguided policy.
@@ -53,6 +54,12 @@ class GuidedConfig:
         field_angle_dims: Action dimensions that are angles: distances in them are the short way round. None finds those in
             which recorded actions jump by a period between two frames.
         field_angle_period: Period of the angles, in the dataset's units [rad; 360 for degrees].
+        field_over: What the field is over: actions, which must be positions; or integrated, for actions that are
+            displacements of the end effector: the positions to which their running sum leads from the observed state.
+        field_displacement_scale: For integrated: what an action of 1 displaces the end effector by, in units of
+            observation.state per unit of action.
+        field_state_dims: For integrated: the dimensions of observation.state that are the end effector's positions in
+            field_action_dims; None for the first ones.
     """
 
     guidance_scale: float = GuidanceSettings.scale
@@ -71,6 +78,9 @@ class GuidedConfig:
     field_leave_out: str = FieldSettings.leave_out
     field_angle_dims: tuple[int, ...] | None = FieldSettings.angle_dims
     field_angle_period: float = FieldSettings.angle_period
+    field_over: str = FieldSettings.over
+    field_displacement_scale: float = FieldSettings.displacement_scale
+    field_state_dims: tuple[int, ...] | None = FieldSettings.state_dims
 
     @property
     def field_settings(self) -> FieldSettings:
@@ -107,6 +117,9 @@ class GuidedConfig:
             self.field_angle_period,
             self.guidance_region,
             self.guidance_quantile,
+            self.field_over,
+            self.field_displacement_scale,
+            None if self.field_state_dims is None else tuple(self.field_state_dims),
         )
 
     def _validate_guidance(self) -> None:
@@ -126,3 +139,19 @@ class GuidedConfig:
             dims = getattr(self, name)
             if dims and max(dims) >= action_dim:
                 raise ValueError(f"{name} must be below the action dimension {action_dim}, got {dims}")
+        if self.field_over == INTEGRATED:
+            self._validate_field_state(len(self.field_action_dims or range(action_dim)))
+
+    def _validate_field_state(self, n_dims: int) -> None:
+        state = getattr(self, "robot_state_feature", None)
+        if state is None:
+            raise ValueError(
+                "field_over=integrated needs observation.state, from which displacements are summed up, got a policy "
+                "without it"
+            )
+        dims = tuple(range(n_dims)) if self.field_state_dims is None else tuple(self.field_state_dims)
+        if len(dims) != n_dims or max(dims) >= state.shape[0]:
+            raise ValueError(
+                f"field_state_dims must be one dimension of observation.state {tuple(state.shape)} for each of the {n_dims} "
+                f"dimensions of the field, got {dims}"
+            )

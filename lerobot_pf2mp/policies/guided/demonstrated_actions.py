@@ -4,15 +4,17 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from typing import cast
 
 import torch
 from torch import Tensor
 
 from lerobot_pf2mp.policies.guided.action_sample import ActionSample
-from lerobot_pf2mp.policies.guided.field_settings import FieldSettings, density_of
+from lerobot_pf2mp.policies.guided.field_settings import ACTIONS, INTEGRATED, FieldSettings, density_of
 from lerobot_pf2mp.policies.guided.field_state import ANCHOR, OUTLYING, SAFE_ANCHOR, FieldState
 from lerobot_pf2mp.policies.guided.fitted_sample import FittedSample, fit_sample, judge_sample
+from lerobot_pf2mp.policies.guided.integrated_actions import Integration
 from lerobot_pf2mp.policies.guided.recorded_angles import RecordedAngles
 from lerobot_pf2mp.policies.plans.calibration import PlanCalibration
 from lerobot_pf2mp.policies.plans.demonstrated_plans import DemonstratedPlans
@@ -24,6 +26,8 @@ logger = logging.getLogger(__name__)
 
 class DemonstratedActions:
     """An `ActionSample` of the frames on which a policy is trained, and the potential field fitted to their actions.
+
+    Of actions that are displacements it gets, and holds, the positions to which they lead (see `integrated_actions`).
 
     Args:
         settings: The settings of the sample and of the field.
@@ -44,6 +48,7 @@ class DemonstratedActions:
             )
         self._dataset_id = dataset_id
         self._sample = ActionSample()
+        self._integration: Integration | None = None
         self.calibration = PlanCalibration()
         self._forget_field()
 
@@ -84,6 +89,7 @@ class DemonstratedActions:
         drop_n_last_frames: int = 0,
         states: Tensor | None = None,
         places: Tensor | None = None,
+        integration: Integration | None = None,
     ) -> None:
         """Adds the actions of a training batch to the sample.
 
@@ -104,6 +110,7 @@ class DemonstratedActions:
             drop_n_last_frames: Number of an episode's last frames with which no plan begins.
             states: ``(B, A)`` observed states at the current step [normalised]; None if there are none.
             places: ``(2, A)`` how states become actions, see `places_of_states`; None if it is unknown.
+            integration: How displacements became the positions that are given as actions; None for actions as recorded.
 
         Raises:
             ValueError: If an action is not finite or a dimension does not exist.
@@ -133,6 +140,9 @@ class DemonstratedActions:
                 n_executed=n_executed,
             )
         actions = _select_dims(actions, settings.action_dims)
+        if settings.over == INTEGRATED:
+            self._integration = integration
+            actions, is_pad, frames, episodes = ActionSample.each_by_itself(actions, is_pad, frames, episodes)
         n_points = settings.n_points
         new = self._sample.candidates(actions, is_pad, frames, episodes, n_points)
         if self._sample.contradicts(new):
@@ -180,8 +190,21 @@ class DemonstratedActions:
         return self.calibration.place_of(_select_dims(states, self.settings.action_dims))
 
     def starts_at_state(self, settings: FieldSettings) -> bool:
-        """Whether an observed state tells where the robot is, in the units of its actions."""
-        return self.calibration.starts_at_state(self._periods(settings))
+        """Whether an observed state tells where the robot is, in the units of its actions.
+
+        Sums of displacements begin there.
+        """
+        return settings.over == INTEGRATED or self.calibration.starts_at_state(self._periods(settings))
+
+    def integration(self, settings: FieldSettings) -> Integration:
+        """How displacements become positions of the field.
+
+        Raises:
+            ValueError: If the field is not fitted, or over other positions than the settings'.
+        """
+        self._check(settings)
+        assert self._integration is not None  # `_check` refuses it
+        return self._integration
 
     def recognise_angles(self, actions: Tensor, is_pad: Tensor | None, unit: Tensor) -> None:
         """Looks for jumps by a period in successive actions, which make their dimension an angle.
@@ -307,6 +330,7 @@ class DemonstratedActions:
             plan_ranks=calibration.plans.ranks.cpu().contiguous(),
             plan_scores=scores,
             n_executed=torch.tensor(n_executed),
+            integration=torch.empty(0, 0) if self._integration is None else self._integration.tensor(),
         ).tensors()
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
@@ -326,6 +350,7 @@ class DemonstratedActions:
             )
         self._sample = ActionSample(read.ranks, read.points.float(), read.episodes, int(read.n_shown))
         self._angles = RecordedAngles(read.unit.float(), read.steps)
+        self._integration = Integration.of_tensor(read.integration) if read.integration.numel() else None
         self._dataset_id = bytes(read.dataset_id.tolist())
         plans = DemonstratedPlans()
         plans.restore(read.plans, read.plan_episodes, read.plan_ranks)
@@ -356,6 +381,12 @@ class DemonstratedActions:
             raise ValueError(
                 f"field_action_dims must be {self.settings.action_dims}, as in training, got {settings.action_dims}"
             )
+        kept = self.settings if self._integration is not None else replace(self.settings, over=ACTIONS)
+        if settings.positions != kept.positions:
+            raise ValueError(
+                f"field_over must be {_described(kept)}, as in training, got {_described(settings)}; pf2mp-fit-field makes "
+                "another field"
+            )
         if settings.n_points > max(len(self), self.settings.n_points):
             raise ValueError(
                 f"n_field_points must be at most {len(self)}, the number of actions kept with the checkpoint, got "
@@ -372,9 +403,19 @@ class DemonstratedActions:
             return "its dataset, episodes or normalisation differ from those of before"
         if settings.action_dims != self.settings.action_dims:
             return f"field_action_dims are {settings.action_dims}, before {self.settings.action_dims}"
+        if settings.positions != self.settings.positions:
+            return f"field_over is {_described(settings)}, before {_described(self.settings)}"
         if settings.n_points > self.settings.n_points and len(self) >= self.settings.n_points:
             return f"n_field_points is {settings.n_points}, before {self.settings.n_points}"
         return None
+
+
+def _described(settings: FieldSettings) -> str:
+    over, scale, state_dims = settings.positions
+    if over != INTEGRATED:
+        return over
+    of_state = "" if state_dims is None else f" and field_state_dims {state_dims}"
+    return f"{over} with field_displacement_scale {scale:g}{of_state}"
 
 
 def _select_dims(actions: Tensor, dims: tuple[int, ...] | None) -> Tensor:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -20,9 +21,16 @@ from torch import Tensor
 from lerobot_pf2mp.flow_matching import Guide
 from lerobot_pf2mp.guidance import GuidanceSettings, make_guide
 from lerobot_pf2mp.policies.batch_keys import ACTION_IS_PAD, POTENTIAL_FIELD
-from lerobot_pf2mp.policies.guided.action_kind import warn_unless_positions
+from lerobot_pf2mp.policies.guided.action_kind import warn_about_actions
 from lerobot_pf2mp.policies.guided.action_units import normalised_unit, normaliser_of, places_of_states
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
+from lerobot_pf2mp.policies.guided.field_settings import INTEGRATED
+from lerobot_pf2mp.policies.guided.integrated_actions import (
+    IntegratedActions,
+    IntegratedGuide,
+    Integration,
+    observe_integrated,
+)
 from lerobot_pf2mp.policies.plans.plan_choice import DrawMore, PlanCheck, choose_plans, react
 from lerobot_pf2mp.policies.plans.plans import Plans, require_finite
 from lerobot_pf2mp.policies.plans.robot_places import RobotPlaces, seen_place
@@ -61,6 +69,7 @@ class FieldGuidance:
         self.config = config
         self._dataset_id = _identify_dataset(dataset_stats, run_episodes(dataset_meta), config)
         self._unit, self._places = _units_of(dataset_stats, config)
+        self._integration = _integration_of(dataset_stats, config)
         self._unchecked_meta = dataset_meta  # until its dataset's actions have been looked at
         self.demonstrations: DemonstratedActions | None = None  # those of the last training batch
         # Whether plans are checked even if nothing acts on it: `plans` then tells of them.
@@ -102,17 +111,22 @@ class FieldGuidance:
         self.demonstrations = demonstrations
         if self._unchecked_meta is not None:
             self._check_dataset()
+        is_integrated = self.config.field_over == INTEGRATED
         states = batch.get(OBS_STATE)
         if states is not None and states.ndim == 3:
             states = states[:, -1]
+        has_places = self._places is not None and bool(self._places.numel())
         actions, is_pad, frames, episodes, states = gather_rows(
             batch[ACTION],
             batch.get(ACTION_IS_PAD),
             batch.get("index"),
             batch.get("episode_index"),
-            states if self._places is not None and self._places.numel() else None,
+            states if is_integrated or has_places else None,
         )
         first = self.config.action_delta_indices[0]
+        if is_integrated:
+            self._observe_integrated(demonstrations, cast(Tensor, actions), is_pad, frames, episodes, states)
+            return
         demonstrations.observe(
             cast(Tensor, actions),
             is_pad,
@@ -128,12 +142,41 @@ class FieldGuidance:
             places=self._places,
         )
 
+    def _observe_integrated(
+        self,
+        demonstrations: DemonstratedActions,
+        actions: Tensor,
+        is_pad: Tensor | None,
+        frames: Tensor | None,
+        episodes: Tensor | None,
+        states: Tensor | None,
+    ) -> None:
+        """Adds the positions to which the displacements of a training batch lead. Arguments as gathered by `observe`."""
+        if self._integration is None or states is None:
+            raise ValueError(
+                "field_over=integrated needs observation.state and the dataset's statistics in training, got a batch or a "
+                "policy without them"
+            )
+        observe_integrated(
+            demonstrations,
+            self._integration,
+            actions[:, -self.config.action_delta_indices[0] :],
+            None if is_pad is None else is_pad[:, -self.config.action_delta_indices[0] :],
+            frames,
+            episodes,
+            states,
+            settings=self.config.field_settings,
+            dataset_id=self._dataset_id,
+            n_executed=self.config.n_action_steps,
+            drop_n_last_frames=getattr(self.config, "drop_n_last_frames", 0) or 0,
+        )
+
     @torch.compiler.disable
     def _check_dataset(self) -> None:
-        """Warns if the actions of the run's dataset are no positions. A streaming dataset is not looked at."""
+        """Warns if the field is over what the actions of the run's dataset are not. A streaming dataset is not looked at."""
         dataset, self._unchecked_meta = find_dataset(self._unchecked_meta), None
         if isinstance(dataset, LeRobotDataset) and is_main_process():
-            warn_unless_positions(dataset, self.config.field_action_dims)
+            warn_about_actions(dataset, self.config.field_settings)
 
     @torch.compiler.disable  # the field may have to be fitted first
     def guide(self, batch: dict[str, Any], device: torch.device) -> Guide | None:
@@ -154,7 +197,29 @@ class FieldGuidance:
         field, made = fitted_field(batch.get(POTENTIAL_FIELD), self.config, device), self._made
         if made is None or made[0] is not field or made[1] != settings:
             made = self._made = field, settings, make_guide(field.prepared, settings)
-        return made[2]
+        robots, guide = self._integrated(batch), made[2]
+        if robots is None or guide is None:
+            return guide
+        return IntegratedGuide(guide, replace(robots, n_past=-self.config.action_delta_indices[0]))
+
+    def _integrated(self, batch: dict[str, Any]) -> IntegratedActions | None:
+        """The robots' integrated actions; None for a field over actions, or if there is no field.
+
+        Raises:
+            ValueError: If the batch has no observed state, or the field is over other positions.
+        """
+        config, demonstrations = self.config, batch.get(POTENTIAL_FIELD)
+        if config.field_over != INTEGRATED or not isinstance(demonstrations, DemonstratedActions):
+            return None
+        if not len(demonstrations):
+            return None
+        states = batch.get(OBS_STATE)
+        if states is None:
+            raise ValueError(f"field_over=integrated needs {OBS_STATE}, got a batch without it")
+        settings = config.field_settings
+        return IntegratedActions.of_robots(
+            demonstrations.integration(settings), settings, states, config.action_feature.shape[0]
+        )
 
     def executed(self, action: Tensor) -> None:
         """Tells that a robot, or a batch of robots, is given an action ``(B, A)`` to execute [normalised]."""
@@ -168,7 +233,19 @@ class FieldGuidance:
             left_over: ``([B,] T_left, A)`` actions of the last chunk that were not executed; None if no robot is moving on
                 them.
             inference_delay: Number of those that are executed until the chunk is needed.
+
+        Raises:
+            ValueError: With real-time chunking and a field over integrated displacements: the robot moves on while the
+                chunk is generated, and where its sums begin is not known.
         """
+        config = self.config
+        rtc = getattr(config, "rtc_config", None)
+        is_rtc = left_over is not None or (rtc is not None and rtc.enabled)
+        if is_rtc and config.field_over == INTEGRATED and (config.guidance_scale or config.checks_plans):
+            raise ValueError(
+                "field_over=integrated must be used without real-time chunking, got it switched on: use "
+                "--inference.type=sync, or guidance_scale=0, max_plans=1 and on_unsupported=ignore"
+            )
         self._robots.begin(left_over, inference_delay)
 
     def choose(
@@ -194,7 +271,37 @@ class FieldGuidance:
         is_asked_for = config.on_unsupported != "ignore" or self.measures_plans
         if torch.compiler.is_compiling() and POTENTIAL_FIELD not in batch and not is_asked_for:
             return require_finite(chunk, batch)  # one graph, for a guide that the caller made
-        return self._choose(batch, chunk, draw_more, is_checked)
+        robots = self._integrated(batch) if is_checked or config.guidance_scale else None
+        if robots is None:
+            return self._choose(batch, chunk, draw_more, is_checked)
+        return self._choose_integrated(batch, robots, chunk, draw_more, is_checked)
+
+    @torch.compiler.disable
+    def _choose_integrated(
+        self,
+        batch: dict[str, Any],
+        robots: IntegratedActions,
+        chunk: Tensor,
+        draw_more: DrawMore | None,
+        is_checked: bool,
+    ) -> Tensor:
+        """The same for displacements: their positions are judged. What is not changed stays as it is, bit for bit."""
+
+        def limited(robots: IntegratedActions, chunk: Tensor) -> Tensor:
+            return robots.within_limits(chunk) if self.config.guidance_scale else chunk
+
+        def draw_positions(rows: Tensor, n_each: int) -> Tensor:
+            assert draw_more is not None
+            some = robots.for_rows(rows, n_each)
+            return some.positions(limited(some, draw_more(rows, n_each)))
+
+        require_finite(chunk, batch)
+        chunk = limited(robots, chunk)
+        proposed = robots.positions(chunk)
+        draw = None if draw_more is None else draw_positions
+        chosen = self._choose(batch, proposed, draw, is_checked, places=robots.begun(chunk[:, 0]))
+        is_same = (chosen == proposed).flatten(1).all(dim=1).reshape(-1, 1, 1)
+        return torch.where(is_same, chunk, robots.displacements(chosen).to(chunk.dtype))
 
     @torch.compiler.disable  # whether other plans are drawn depends on the values
     def _choose(
@@ -203,13 +310,15 @@ class FieldGuidance:
         chunk: Tensor,
         draw_more: DrawMore | None,
         is_checked: bool,
+        places: Tensor | None = None,
     ) -> Tensor:
+        """As `choose`, with places ``(B, A)`` where the robots are known to be; None if that is to be found out."""
         require_finite(chunk, batch)
-        self.plans, places = None, None
+        self.plans, observed, places = None, places, None
         check = self._plan_check(batch, chunk) if is_checked else None
         if check is not None:
             config, robots = self.config, self._robots
-            known = self._places_of_robots(batch, chunk)
+            known = self._places_of_robots(batch, chunk) if observed is None else observed
             places = chunk[:, 0] if known is None else known
             has_time = robots.budget.allows_another_pass(robots.n_steps, config.max_plans - 1)
             began = time.perf_counter()
@@ -319,6 +428,20 @@ def _units_of(
     return normalised_unit(normaliser, action_dim), places_of_states(normaliser, action_dim)
 
 
+def _integration_of(
+    dataset_stats: dict[str, dict[str, Any]] | None, config: GuidedPolicyConfig
+) -> Integration | None:
+    """How displacements of a dataset become positions; None at evaluation, or for a field over actions."""
+    if config.field_over != INTEGRATED or not dataset_stats or ACTION not in dataset_stats:
+        return None
+    return Integration.of(
+        normaliser_of(config, dataset_stats),
+        config.field_settings,
+        config.action_feature.shape[0],
+        dataset_stats[ACTION],
+    )
+
+
 def _identify_dataset(
     dataset_stats: dict[str, dict[str, Any]] | None, episodes: list[int] | None, config: GuidedPolicyConfig
 ) -> bytes:
@@ -331,7 +454,8 @@ def _identify_dataset(
     if not dataset_stats or ACTION not in dataset_stats:
         return b""
     digest = hashlib.sha256(str(config.normalization_mapping.get("ACTION")).encode())
-    for name, value in sorted(dataset_stats[ACTION].items()):
+    keys = (ACTION, OBS_STATE) if config.field_over == INTEGRATED else (ACTION,)
+    for name, value in [item for key in keys for item in sorted(dataset_stats.get(key, {}).items())]:
         digest.update(name.encode())
         digest.update(np.asarray(value, dtype=np.float64).tobytes())
     if episodes is not None:

@@ -17,6 +17,7 @@ from lerobot_pf2mp.potential_field import (
 )
 
 REGIONS = ("everywhere", "unsupported", "fading")
+ACTIONS, INTEGRATED = FIELD_OVER = "actions", "integrated"
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,10 @@ class FieldSettings:
         region: Where the field pulls, one of `REGIONS`: everywhere; unsupported, where the log density is below that of
             `quantile`; or fading, fully outside the safe set and the less the nearer the log density is to that quantile.
         quantile: The quantile of the actions' log densities above which the field does not pull, in (0, 1).
+        over: What the field is over, one of `FIELD_OVER`: actions, which are positions, or the positions to which
+            displacements lead from the observed state (integrated), see `integrated_actions`.
+        displacement_scale: What a displacement of 1 moves the observed state by, in the state's units per unit of action.
+        state_dims: The dimensions of the observed state that are the positions of ``action_dims``; None for the first ones.
 
     Raises:
         ValueError: If a value breaks its rule. The message names the option of the policy's configuration.
@@ -51,6 +56,9 @@ class FieldSettings:
     angle_period: float = 2 * math.pi
     region: str = "unsupported"
     quantile: float = 0.95
+    over: str = ACTIONS
+    displacement_scale: float = 1.0
+    state_dims: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         if self.n_points < 1:
@@ -73,10 +81,40 @@ class FieldSettings:
             raise ValueError(f"guidance_region must be one of {REGIONS}, got {self.region!r}")
         if not 0 < self.quantile < 1:
             raise ValueError(f"guidance_quantile must lie between 0 and 1, got {self.quantile}")
+        self._check_over()
         check_left_out(self.leave_out, "field_leave_out")
         check_bandwidth_rule(self.bandwidth, "field_bandwidth")
         check_threshold_quantile(self.threshold_quantile, "field_threshold_quantile")
         check_alpha(self.alpha, "field_alpha")
+
+    def _check_over(self) -> None:
+        if self.over not in FIELD_OVER:
+            raise ValueError(f"field_over must be one of {FIELD_OVER}, got {self.over!r}")
+        if not (self.displacement_scale > 0 and math.isfinite(self.displacement_scale)):
+            raise ValueError(
+                f"field_displacement_scale must be finite and positive, got {self.displacement_scale}"
+            )
+        if self.state_dims is not None:
+            object.__setattr__(self, "state_dims", tuple(self.state_dims))
+            _check_dims("field_state_dims", self.state_dims)
+            if self.action_dims is not None and len(self.state_dims) != len(self.action_dims):
+                raise ValueError(
+                    f"field_state_dims must be as many as field_action_dims {self.action_dims}, got {self.state_dims}"
+                )
+        if self.over == INTEGRATED and self.angle_dims:
+            raise ValueError(
+                f"field_angle_dims must be empty or null with field_over=integrated, got {self.angle_dims}: sums of "
+                "displacements do not jump by a turn"
+            )
+
+    @property
+    def positions(self) -> tuple[str, float, tuple[int, ...] | None]:
+        """What says which positions the field is over, besides its action dimensions."""
+        return (
+            (self.over, self.displacement_scale, self.state_dims)
+            if self.over == INTEGRATED
+            else (self.over, 1.0, None)
+        )
 
 
 @lru_cache(maxsize=64)

@@ -39,6 +39,7 @@ class FieldState:
         plan_ranks: ``(E,)`` int64, the ranks of their first frames.
         plan_scores: ``(n,)`` the support of demonstrated plans [nats]; empty if unknown.
         n_executed: Number of their actions on whose way that is.
+        integration: ``(5, D)`` how displacements become positions, see `Integration`; empty for a field over actions.
     """
 
     points: Tensor
@@ -58,6 +59,7 @@ class FieldState:
     plan_ranks: Tensor
     plan_scores: Tensor
     n_executed: Tensor
+    integration: Tensor
 
     def tensors(self) -> dict[str, Tensor]:
         """The tensors by name."""
@@ -74,7 +76,7 @@ class FieldState:
             ValueError: If an entry is missing or of the wrong kind, as in a corrupted file.
         """
         added = {"episodes", "unit", "steps", "role", "places", "held_out", "n_executed"}
-        added |= {"plans", "plan_episodes", "plan_ranks", "plan_scores"}
+        added |= {"plans", "plan_episodes", "plan_ranks", "plan_scores", "integration"}
         wanted = {field.name for field in fields(cls)} - added
         if not wanted <= set(tensors):
             raise ValueError(
@@ -110,6 +112,7 @@ class FieldState:
             "plan_ranks": torch.empty(0, dtype=torch.int64),
             "plan_scores": torch.empty(0),
             "n_executed": torch.tensor(1),
+            "integration": torch.empty(0, 0),
         }
         if len(tensors.get("unit", ())) not in (0, points.shape[1]):
             # Points of other dimensions than the policy's. The policy says so where it needs the field.
@@ -157,7 +160,12 @@ class FieldState:
                 f"places in a potential field file must be 2 x {dim} numbers, got {tuple(self.places.shape)}: it is "
                 "corrupted"
             )
-        for name in ("places", "held_out", "plans", "plan_scores"):
+        if self.integration.numel() and self.integration.shape != (5, dim):
+            raise ValueError(
+                f"integration in a potential field file must be 5 x {dim} numbers, got {tuple(self.integration.shape)}: it "
+                "is corrupted"
+            )
+        for name in ("places", "held_out", "plans", "plan_scores", "integration"):
             value = getattr(self, name)
             if value.dtype != torch.float32 or not bool(value.isfinite().all()):
                 raise ValueError(

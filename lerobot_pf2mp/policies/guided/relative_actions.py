@@ -22,7 +22,8 @@ def refuse_relative_actions(steps: Iterable[Any]) -> None:
     if any(isinstance(step, RelativeActionsProcessorStep) and step.enabled for step in steps):
         raise ValueError(
             "a potential field needs actions that are absolute positions, got a preprocessor that makes them relative to "
-            "the state (relative_actions_processor, enabled=true): train with use_relative_actions=false"
+            "the state (relative_actions_processor, enabled=true), which field_over=integrated does not add up either: "
+            "train with use_relative_actions=false"
         )
 
 
