@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Makes the table of where guidance was tried from the published results: one row for each policy and task.
 
-    python tests/benchmarks/where_tried.py
+python tests/benchmarks/where_tried.py
 """
 
 from __future__ import annotations
