@@ -81,8 +81,9 @@ def bulges_past(
         directions = _sideways(tangent)  # (R, S, D)
     else:
         directions = _across(obstacle.mirrored(sides[:, None])[:, 0], tangent).unsqueeze(1)
-    extent = reach + (tangent.abs() * half_sides).sum(dim=-1)
-    is_blocked_at_end = rounded_box_distance(local[:, -1], half_sides) < reach
+    is_blocked = rounded_box_distance(local, half_sides.unsqueeze(1)) < reach.unsqueeze(1)  # (R, C)
+    extent = along.extent(reach + (tangent.abs() * half_sides).sum(dim=-1), is_blocked)
+    is_blocked_at_end = is_blocked[:, -1]
     shape = along.bump(_LENGTH * extent, is_blocked_at_end)  # (R, C)
     longest = torch.where(shape[:, 1:] > 0, along.lengths, 0.0).amax(dim=-1)
     reach = (reach.square() + (_STRETCH * 0.5 * longest).square()).sqrt()
@@ -127,6 +128,12 @@ class _Along:
         first = torch.zeros_like(mean)
         first[:, 0] = 1.0
         return torch.where(length > _TINY, mean / length.clamp_min(_TINY), first)
+
+    def extent(self, length: Tensor, is_blocked: Tensor) -> Tensor:
+        """``(R,)`` at least the lengths ``(R,)``, and up to the last blocked corner within twice of them, to either side."""
+        offset = (self.at - self.nearest.unsqueeze(1)).abs()
+        is_near = is_blocked & (offset < 2 * length.unsqueeze(1))
+        return torch.maximum(length, torch.where(is_near, offset, 0.0).amax(dim=1))
 
     def bump(self, half_length: Tensor, is_blocked_at_end: Tensor) -> Tensor:
         """``(R, C)`` the shape of bulges of a half length ``(R,)``, at most 1, and 0 where the way must not move.

@@ -49,9 +49,7 @@ class Passing:
         """``(B, C - 1)`` the distance to the nearest obstacle on each piece of ways ``(B, C, D)``, minus the clearance."""
         return self.obstacles.swept_distance(ways, times)[0].amin(dim=1) - self.clearance
 
-    def __call__(
-        self, ways: Tensor, times: Tensor, n_fixed: int = 1, n_rounds: int = N_ROUNDS
-    ) -> Tensor:
+    def __call__(self, ways: Tensor, times: Tensor, n_fixed: int = 1, n_rounds: int = N_ROUNDS) -> Tensor:
         """The ways, of which those that come too near an obstacle are bent; the others are returned as they are.
 
         Args:
