@@ -97,8 +97,14 @@ def bulges_past(
 
 @dataclass(frozen=True, eq=False)
 class _Along:
-    """Lengths along ways, as seen from an obstacle: ``lengths`` ``(R, C - 1)`` and ``steps`` of the pieces, ``at`` ``(R, C)``
-    of the corners, ``nearest`` ``(R,)`` of where it is nearest, and the number of corners that are fixed.
+    """Lengths along ways, as seen from an obstacle.
+
+    Args:
+        steps: ``(R, C - 1, D)`` the pieces.
+        lengths: ``(R, C - 1)`` theirs.
+        at: ``(R, C)`` the lengths to the corners.
+        nearest: ``(R,)`` the length to where the way is nearest.
+        n_fixed: Number of first corners that stay.
     """
 
     steps: Tensor

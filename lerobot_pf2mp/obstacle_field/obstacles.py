@@ -89,7 +89,8 @@ class Obstacles:
         first_axis[..., 2 * dim] = 1.0
         values = torch.where(is_present.unsqueeze(-1), rows[..., 1:], first_axis)
         parts = values.split([dim, dim, dim, dim, 1], dim=-1)
-        made = cls(*parts[:4], parts[4].squeeze(-1), is_present)
+        centre, half_sides, axis, velocity, radius = parts
+        made = cls(centre, half_sides, axis, velocity, radius.squeeze(-1), is_present)
         is_sized = (made.half_sides >= 0).all(-1) & (made.radius >= 0)
         is_valid = values.isfinite().all(-1) & is_sized & ((made.axis.norm(dim=-1) - 1).abs() < 1e-3)
         if not bool(is_valid.all()):
@@ -102,6 +103,10 @@ class Obstacles:
     def __getitem__(self, index: Tensor | slice) -> Obstacles:
         """Those of some robots."""
         return Obstacles(*(getattr(self, field.name)[index] for field in fields(self)))
+
+    def to(self, device: torch.device | str) -> Obstacles:
+        """The same on a device."""
+        return Obstacles(*(getattr(self, field.name).to(device) for field in fields(self)))
 
     def only(self, k: int) -> Obstacles:
         """The k-th obstacle of each robot."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -23,7 +24,9 @@ from lerobot_pf2mp.policies.batch_keys import ACTION_IS_PAD, POTENTIAL_FIELD
 from lerobot_pf2mp.policies.guided.action_kind import warn_unless_positions
 from lerobot_pf2mp.policies.guided.action_units import normalised_unit, normaliser_of, places_of_states
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
-from lerobot_pf2mp.policies.plans.plan_choice import DrawMore, PlanCheck, choose_plans, react
+from lerobot_pf2mp.policies.obstacles.known_obstacles import OBS_OBSTACLES, known_obstacles
+from lerobot_pf2mp.policies.obstacles.obstacle_guidance import ObstacleCheck, ObstacleGuidance
+from lerobot_pf2mp.policies.plans.plan_choice import DrawMore, PlanCheck, WayCheck, choose_plans, react
 from lerobot_pf2mp.policies.plans.plans import Plans, require_finite
 from lerobot_pf2mp.policies.plans.robot_places import RobotPlaces, seen_place
 from lerobot_pf2mp.potential_field import PotentialField
@@ -76,6 +79,7 @@ class FieldGuidance:
     def reset(self) -> None:
         """Forgets the plans and actions of before. Must be called at the start of an episode."""
         self.plans: Plans | None = None  # of the last call; None if they were not checked
+        self._obstacles: ObstacleGuidance | None = None  # of the call that began
         self._robots = RobotPlaces()
 
     @property
@@ -137,17 +141,24 @@ class FieldGuidance:
 
     @torch.compiler.disable  # the field may have to be fitted first
     def guide(self, batch: dict[str, Any], device: torch.device) -> Guide | None:
-        """The configured guide over the batch's field; None with a guidance scale of 0.
+        """The configured guide over the batch's field, past the obstacles that are known; None if nothing guides.
 
-        A guide is made once for a field and settings. It is kept until one of them changes.
+        The field's guide is made once for a field and settings. It is kept until one of them changes.
 
         Args:
             batch: A batch that the policy's own preprocessor has made.
             device: The device of the actions to be guided.
 
         Raises:
-            ValueError: If the batch holds no field, or one over other dimensions.
+            ValueError: If the batch holds no field, or one over other dimensions; or if an obstacle is wrong.
         """
+        guide = self._field_guide(batch, device)
+        self._obstacles = self._known_obstacles(batch, device)
+        if self._obstacles is None or self.config.obstacle_rule != "pass":
+            return guide
+        return self._obstacles.guided(guide)
+
+    def _field_guide(self, batch: dict[str, Any], device: torch.device) -> Guide | None:
         settings = self.config.guidance_settings
         if settings.scale == 0:
             return None
@@ -169,6 +180,7 @@ class FieldGuidance:
                 them.
             inference_delay: Number of those that are executed until the chunk is needed.
         """
+        self._obstacles = None
         self._robots.begin(left_over, inference_delay)
 
     def choose(
@@ -192,7 +204,8 @@ class FieldGuidance:
         config = self.config
         is_checked = config.checks_plans or self.measures_plans
         is_asked_for = config.on_unsupported != "ignore" or self.measures_plans
-        if torch.compiler.is_compiling() and POTENTIAL_FIELD not in batch and not is_asked_for:
+        is_free = not config.obstacles and OBS_OBSTACLES not in batch
+        if torch.compiler.is_compiling() and POTENTIAL_FIELD not in batch and not is_asked_for and is_free:
             return require_finite(chunk, batch)  # one graph, for a guide that the caller made
         return self._choose(batch, chunk, draw_more, is_checked)
 
@@ -206,7 +219,11 @@ class FieldGuidance:
     ) -> Tensor:
         require_finite(chunk, batch)
         self.plans, places = None, None
-        check = self._plan_check(batch, chunk) if is_checked else None
+        check: WayCheck | None = self._plan_check(batch, chunk) if is_checked else None
+        obstacles, self._obstacles = self._obstacles or self._known_obstacles(batch, chunk.device), None
+        if obstacles is not None and self.config.obstacle_rule == "pass":
+            chunk, draw_more = obstacles.finished(chunk), obstacles.drawn_past(draw_more)
+            check = ObstacleCheck(obstacles, check) if is_checked else None
         if check is not None:
             config, robots = self.config, self._robots
             known = self._places_of_robots(batch, chunk)
@@ -218,7 +235,11 @@ class FieldGuidance:
             )
             if bool((self.plans.n_drawn > 1).any()):
                 robots.budget.took(time.perf_counter() - began)
+            if isinstance(check, ObstacleCheck):
+                self.plans = replace(self.plans, clearance=check.guidance.clearances(chunk))
             chunk = react(config.on_unsupported, self.plans, chunk, known, robots.n_steps or 0)
+        if obstacles is not None and self.config.obstacle_rule == "project":
+            chunk = obstacles.projected(chunk)
         self._robots.end(chunk, places)
         return chunk
 
@@ -250,6 +271,38 @@ class FieldGuidance:
         if message not in self._said:
             self._said.add(message)
             logger.warning(message, *arguments)
+
+    def _known_obstacles(self, batch: dict[str, Any], device: torch.device) -> ObstacleGuidance | None:
+        """What is done about obstacles in this call; None if none is known, or they are ignored."""
+        config = self.config
+        if not config.obstacles and OBS_OBSTACLES not in batch:
+            return None
+        dims, action_dim = config.field_settings.action_dims, config.action_feature.shape[0]
+        obstacles = known_obstacles(config, batch, action_dim if dims is None else len(dims))
+        if obstacles is None:
+            return None
+        units = getattr(batch.get(POTENTIAL_FIELD), "recorded_units", None)
+        if units is None:
+            raise ValueError(
+                "obstacles need the units of the recorded actions, which the policy's own preprocessor knows; got a batch "
+                "without it, or a normalisation of actions that is not one to one. obstacle_rule=ignore leaves them out"
+            )
+        units = units.on(dims, device)
+        n_robots = next(len(v) for k, v in batch.items() if k.startswith("observation.") and len(v))
+        places = self._places_of_robots(batch, torch.zeros(n_robots, 1, action_dim, device=device))
+        if places is not None:
+            places = units.recorded(places if dims is None else places[:, list(dims)])
+        guiding = config.guidance_scale > 0
+        return ObstacleGuidance(
+            config,
+            obstacles.to(device),
+            units,
+            dims,
+            places,
+            fitted_field(batch.get(POTENTIAL_FIELD), config, device) if guiding else None,
+            n_past=-config.action_delta_indices[0],
+            n_committed=self._robots.n_steps or 0,
+        )
 
     def _places_of_robots(self, batch: dict[str, Any], chunk: Tensor) -> Tensor | None:
         """Where the robots are when they begin to execute a chunk, as actions ``(B, A)`` [normalised]; None if unknown.
