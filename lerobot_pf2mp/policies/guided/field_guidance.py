@@ -79,7 +79,6 @@ class FieldGuidance:
     def reset(self) -> None:
         """Forgets the plans and actions of before. Must be called at the start of an episode."""
         self.plans: Plans | None = None  # of the last call; None if they were not checked
-        self._obstacles: ObstacleGuidance | None = None  # of the call that began
         self._robots = RobotPlaces()
 
     @property
@@ -141,24 +140,17 @@ class FieldGuidance:
 
     @torch.compiler.disable  # the field may have to be fitted first
     def guide(self, batch: dict[str, Any], device: torch.device) -> Guide | None:
-        """The configured guide over the batch's field, past the obstacles that are known; None if nothing guides.
+        """The configured guide over the batch's field; None with a guidance scale of 0.
 
-        The field's guide is made once for a field and settings. It is kept until one of them changes.
+        A guide is made once for a field and settings. It is kept until one of them changes.
 
         Args:
             batch: A batch that the policy's own preprocessor has made.
             device: The device of the actions to be guided.
 
         Raises:
-            ValueError: If the batch holds no field, or one over other dimensions; or if an obstacle is wrong.
+            ValueError: If the batch holds no field, or one over other dimensions.
         """
-        guide = self._field_guide(batch, device)
-        self._obstacles = self._known_obstacles(batch, device)
-        if self._obstacles is None or self.config.obstacle_rule != "pass":
-            return guide
-        return self._obstacles.guided(guide)
-
-    def _field_guide(self, batch: dict[str, Any], device: torch.device) -> Guide | None:
         settings = self.config.guidance_settings
         if settings.scale == 0:
             return None
@@ -180,7 +172,6 @@ class FieldGuidance:
                 them.
             inference_delay: Number of those that are executed until the chunk is needed.
         """
-        self._obstacles = None
         self._robots.begin(left_over, inference_delay)
 
     def choose(
@@ -220,7 +211,7 @@ class FieldGuidance:
         require_finite(chunk, batch)
         self.plans, places = None, None
         check: WayCheck | None = self._plan_check(batch, chunk) if is_checked else None
-        obstacles, self._obstacles = self._obstacles or self._known_obstacles(batch, chunk.device), None
+        obstacles = self._known_obstacles(batch, chunk)
         if obstacles is not None and self.config.obstacle_rule == "pass":
             chunk, draw_more = obstacles.finished(chunk), obstacles.drawn_past(draw_more)
             check = ObstacleCheck(obstacles, check) if is_checked else None
@@ -272,7 +263,7 @@ class FieldGuidance:
             self._said.add(message)
             logger.warning(message, *arguments)
 
-    def _known_obstacles(self, batch: dict[str, Any], device: torch.device) -> ObstacleGuidance | None:
+    def _known_obstacles(self, batch: dict[str, Any], chunk: Tensor) -> ObstacleGuidance | None:
         """What is done about obstacles in this call; None if none is known, or they are ignored."""
         config = self.config
         if not config.obstacles and OBS_OBSTACLES not in batch:
@@ -287,20 +278,18 @@ class FieldGuidance:
                 "obstacles need the units of the recorded actions, which the policy's own preprocessor knows; got a batch "
                 "without it, or a normalisation of actions that is not one to one. obstacle_rule=ignore leaves them out"
             )
-        units = units.on(dims, device)
-        n_robots = next(len(v) for k, v in batch.items() if k.startswith("observation.") and len(v))
-        places = self._places_of_robots(batch, torch.zeros(n_robots, 1, action_dim, device=device))
+        units = units.on(dims, chunk.device)
+        places = self._places_of_robots(batch, chunk)
         if places is not None:
             places = units.recorded(places if dims is None else places[:, list(dims)])
         guiding = config.guidance_scale > 0
         return ObstacleGuidance(
             config,
-            obstacles.to(device),
+            obstacles.to(chunk.device),
             units,
             dims,
             places,
-            fitted_field(batch.get(POTENTIAL_FIELD), config, device) if guiding else None,
-            n_past=-config.action_delta_indices[0],
+            fitted_field(batch.get(POTENTIAL_FIELD), config, chunk.device) if guiding else None,
             n_committed=self._robots.n_steps or 0,
         )
 
