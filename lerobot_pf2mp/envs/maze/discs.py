@@ -45,7 +45,8 @@ class Discs:
         self._free = {(i, j) for i, row in enumerate(rows) for j, cell in enumerate(row) if cell != 1}
         self._places = np.zeros((n_discs, 2))
         self._across = np.zeros((n_discs, 2))
-        self._offsets = np.zeros(n_discs)  # for moving discs the phase, as a length [m]
+        # Across the corridor; of moving discs the phase, as a length [m].
+        self._offsets: np.ndarray = np.zeros(n_discs)
         self.is_present = np.zeros(n_discs, dtype=bool)
 
     def place(self, start: np.ndarray, goal: np.ndarray, rng: np.random.Generator) -> None:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Obstacles in one call of a policy: on its finished plans, and in their check.
 
-Bulges on the end point that each integration step predicts were measured too. On the large maze with three discs on the way
-(150 episodes, one plan), 18 plans hit a wall with them, and 9 with bulges on the finished plan alone, for half the time. What
-is bent in one step, the network sends another way in the next.
+Bulges on the end point that each integration step predicts were measured too. On the large maze with three discs on the
+way (150 episodes, one plan), 18 plans hit a wall with them, and 9 with bulges on the finished plan alone, for half the time.
+What is bent in one step, the network sends another way in the next.
 """
 
 from __future__ import annotations
