@@ -281,8 +281,11 @@ def test_fixed_corners_stay_and_the_end_stays_unless_it_is_blocked() -> None:
 
 def test_between_two_obstacles_without_room_the_rounds_end_and_the_distance_tells() -> None:
     way = torch.stack([torch.linspace(-2, 2, 41), torch.zeros(41)], dim=1).unsqueeze(0)
-    balls = obstacles_of([{"type": "ball", "centre": [0.0, 0.3 * i], "radius": 0.1} for i in range(-3, 4)])
-    passing = Passing(balls, 0.2, lambda points: -1e3 * points[:, 1].abs(), lambda points: -0.5 * points)
+    ring = [
+        {"type": "ball", "centre": [2 + math.cos(math.pi * i / 4), math.sin(math.pi * i / 4)], "radius": 0.1}
+        for i in range(8)
+    ]
+    passing = Passing(obstacles_of(ring), 0.4)  # around the goal, with gaps of 0.57
     bent = passing(way, torch.zeros(41))
     assert bent.isfinite().all() and passing.clearances(bent, torch.zeros(41)).min() < -0.05
 

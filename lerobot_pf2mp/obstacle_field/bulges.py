@@ -25,6 +25,9 @@ from lerobot_pf2mp.obstacle_field.obstacles import Obstacles, nearest_share, rou
 # maze with three discs on the way, 31 % of plans hit a wall with 1.6, 12 % with 3.
 _LENGTH = 3.0
 
+# And at least this many of the nearest piece of the way, so that the actions at its ends move.
+_PIECES = 2.0
+
 # An action at the foot of a bulge, below this share of its height, does not make the bulge higher.
 _FOOT = 0.15
 
@@ -85,7 +88,8 @@ def bulges_past(
     is_blocked = rounded_box_distance(local, half_sides.unsqueeze(1)) < reach.unsqueeze(1)  # (R, C)
     extent = along.extent(reach + (tangent.abs() * half_sides).sum(dim=-1), is_blocked)
     is_blocked_at_end = is_blocked[:, -1]
-    shape = along.bump(_LENGTH * extent, is_blocked_at_end)  # (R, C)
+    half_length = torch.maximum(_LENGTH * extent, _PIECES * along.nearest_length)
+    shape = along.bump(half_length, is_blocked_at_end)  # (R, C)
     longest = torch.where(shape[:, 1:] > 0, along.lengths, 0.0).amax(dim=-1)
     reach = (reach.square() + (_STRETCH * 0.5 * longest).square()).sqrt()
     needed = _exit_distances(local, directions, half_sides, reach)  # (R, S, C)
@@ -105,6 +109,7 @@ class _Along:
         lengths: ``(R, C - 1)`` theirs.
         at: ``(R, C)`` the lengths to the corners.
         nearest: ``(R,)`` the length to where the way is nearest.
+        nearest_length: ``(R,)`` that of the piece which is.
         n_fixed: Number of first corners that stay.
     """
 
@@ -112,6 +117,7 @@ class _Along:
     lengths: Tensor
     at: Tensor
     nearest: Tensor
+    nearest_length: Tensor
     n_fixed: int
 
     @classmethod
@@ -124,7 +130,7 @@ class _Along:
         distance = rounded_box_distance(local[:, :-1] + share.unsqueeze(-1) * steps, sides)
         piece = distance.argmin(dim=-1, keepdim=True)
         nearest = (at[:, :-1] + share * lengths).gather(1, piece).squeeze(1)
-        return cls(steps, lengths, at, nearest, n_fixed)
+        return cls(steps, lengths, at, nearest, lengths.gather(1, piece).squeeze(1), n_fixed)
 
     def tangent(self, width: Tensor) -> Tensor:
         """``(R, D)`` the direction of the way within some lengths ``(R,)`` of where it is nearest."""
