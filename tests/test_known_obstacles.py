@@ -70,7 +70,7 @@ def test_without_an_obstacle_near_the_plan_is_the_same_bit_for_bit(checkpoint: s
 def test_of_several_robots_only_those_with_an_obstacle_on_the_way_are_bent(checkpoint: str) -> None:
     plain, _ = chunk_of(checkpoint, observed(), max_plans=1)
     rows = torch.zeros(3, 2, 10)
-    middle = (HALF_WIDTH * plain[1, 1:3].mean(dim=0)).tolist()
+    middle = load_policy(checkpoint, device="cpu")[2](plain[1, 1:3].mean(dim=0, keepdim=True))[0].tolist()
     rows[1:2, :1] = rows_of({**BALL, "centre": middle, "radius": 0.05})
     chunk, policy = chunk_of(
         checkpoint, observed(**{OBS_OBSTACLES: rows}), max_plans=1, on_unsupported="warn"
