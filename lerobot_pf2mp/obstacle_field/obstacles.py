@@ -110,7 +110,11 @@ class Obstacles:
 
     def only(self, k: int) -> Obstacles:
         """The k-th obstacle of each robot."""
-        return Obstacles(*(getattr(self, field.name)[:, k : k + 1] for field in fields(self)))
+        return self.one_each(slice(None), k)
+
+    def one_each(self, robots: Tensor | slice, k: Tensor | int) -> Obstacles:
+        """One obstacle (K = 1) for each of some robots ``(P,)``: their k-th ``(P,)`` ones."""
+        return Obstacles(*(getattr(self, field.name)[robots, k].unsqueeze(1) for field in fields(self)))
 
     def beside(self, others: Sequence[Obstacles]) -> Obstacles:
         """These and others, of the same robots."""

@@ -12,8 +12,9 @@ from torch import Tensor
 from lerobot_pf2mp.obstacle_field.bulges import Bulges, bulges_past
 from lerobot_pf2mp.obstacle_field.obstacles import Obstacles
 
-# Rounds of a pull to the density and all bulges. A way that is not clear after them is left to the check of plans.
-N_ROUNDS = 4
+# Rounds of a pull to the density and all bulges. A way that is not clear after them is left to the check of plans. On the
+# large maze with three discs, more rounds changed nothing.
+N_ROUNDS = 2
 
 # A side whose bulge runs into another obstacle is worse than any density, the more so the deeper [nats].
 _OTHER_OBSTACLE = 1e4
@@ -30,7 +31,8 @@ class Passing:
     bulges take turns, the bulges last: with the pull last, it would undo them.
 
     It is bounded: each round draws at most one bulge for each obstacle, each bulge is computed in a fixed number of steps,
-    and there are at most `N_ROUNDS`. Between two obstacles that leave no room for the clearance, the bulges of one run into
+    and there are at most `N_ROUNDS`. The bulges of a round are added, so where those of two obstacles overlap, a way bulges
+    more than it must, or, on different sides, less. Between two obstacles that leave no room for the clearance, the bulges of one run into
     the other in every round. What is left of such a way is what the last round made of it, and the distance tells.
 
     Args:
@@ -97,37 +99,36 @@ class _Turns:
         return pulled
 
     def push(self, ways: Tensor) -> Tensor:
-        """The ways after a bulge past each obstacle that they come too near."""
-        for k in range(self._obstacles.n_each):
-            distance, _ = self._obstacles.only(k).swept_distance(ways, self._times)
-            rows = (distance[:, 0].amin(dim=1) < self._passing.clearance).nonzero().squeeze(1)
-            if not len(rows):
-                continue
-            has_side = self._sides[rows, k].abs().amax(dim=-1) > 0
-            for chosen, sides in ((rows[has_side], True), (rows[~has_side], False)):
-                if len(chosen):
-                    shifts = self._shifts(ways, chosen, k, sides)
-                    self._is_moved[chosen] += (shifts.abs().amax(dim=-1) > 0).to(ways)
-                    ways = ways.index_add(0, chosen, shifts)
-        return ways
+        """The ways after a bulge past each obstacle that they come too near, all at once."""
+        distance, _ = self._obstacles.swept_distance(ways, self._times)
+        is_near = distance.amin(dim=2) < self._passing.clearance  # (R, K)
+        is_chosen = self._sides.abs().amax(dim=-1) > 0
+        pushed = ways
+        for pairs, has_sides in ((is_near & is_chosen, True), (is_near & ~is_chosen, False)):
+            rows, k = pairs.nonzero(as_tuple=True)
+            if len(rows):
+                shifts = self._shifts(ways[rows], rows, k, has_sides)
+                pushed = pushed.index_add(0, rows, shifts)
+        self._is_moved += ((pushed - ways).abs().amax(dim=-1) > 0).to(ways)
+        return pushed
 
-    def _shifts(self, ways: Tensor, rows: Tensor, k: int, has_sides: bool) -> Tensor:
-        """``(R', C, D)`` the bulges of some ways past their k-th obstacle, on the side that is chosen, or chosen now."""
-        passing, part = self._passing, ways[rows]
+    def _shifts(self, ways: Tensor, rows: Tensor, k: Tensor, has_sides: bool) -> Tensor:
+        """``(P, C, D)`` the bulges of ways past one obstacle each, on the side that is chosen, or chosen now."""
+        passing = self._passing
         sides = self._sides[rows, k] if has_sides else None
-        obstacle = self._obstacles[rows].only(k)
-        bulges = bulges_past(obstacle, part, self._times, passing.clearance, self._n_fixed, sides)
+        obstacle = self._obstacles.one_each(rows, k)
+        bulges = bulges_past(obstacle, ways, self._times, passing.clearance, self._n_fixed, sides)
         if has_sides:
             return bulges.shifts[:, 0]
-        best = self._scores(part, rows, bulges).argmax(dim=1)  # (R',)
-        robots = torch.arange(len(rows), device=rows.device)
-        self._sides[rows, k] = bulges.sides[robots, best]
-        return bulges.shifts[robots, best]
+        best = self._scores(ways, rows, bulges).argmax(dim=1)  # (P,)
+        pair = torch.arange(len(rows), device=rows.device)
+        self._sides[rows, k] = bulges.sides[pair, best]
+        return bulges.shifts[pair, best]
 
     def _scores(self, ways: Tensor, rows: Tensor, bulges: Bulges) -> Tensor:
-        """``(R', S)`` how well each bulge is supported: the smallest log density of the corners that it moves [nats]."""
+        """``(P, S)`` how well each bulge is supported: the smallest log density of the corners that it moves [nats]."""
         n_sides = bulges.shifts.shape[1]
-        bent = ways.unsqueeze(1) + bulges.shifts  # (R', S, C, D)
+        bent = ways.unsqueeze(1) + bulges.shifts  # (P, S, C, D)
         density = self._passing.log_density
         if density is None:
             scores = -bulges.heights
