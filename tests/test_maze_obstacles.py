@@ -44,7 +44,7 @@ def test_start_and_goal_are_those_without_obstacles_and_discs_those_of_the_seed(
 def test_a_free_way_exists_beside_every_disc_at_any_time(speed: float) -> None:
     env, n_present = make(speed=speed), 0
     for seed in range(40):
-        seen, info = env.reset(seed=seed)
+        _, info = env.reset(seed=seed)
         assert info["obstacle_clearance"] > 0.1 and not info["is_obstacle_collision"]
         discs = env._discs
         assert discs is not None

@@ -32,8 +32,9 @@ class Passing:
 
     It is bounded: each round draws at most one bulge for each obstacle, each bulge is computed in a fixed number of steps,
     and there are at most `N_ROUNDS`. The bulges of a round are added, so where those of two obstacles overlap, a way bulges
-    more than it must, or, on different sides, less. Between two obstacles that leave no room for the clearance, the bulges of one run into
-    the other in every round. What is left of such a way is what the last round made of it, and the distance tells.
+    more than it must, or, on different sides, less. Between two obstacles that leave no room for the clearance, the bulges
+    of one run into the other in every round. What is left of such a way is what the last round made of it, and the distance
+    tells.
 
     Args:
         obstacles: K for each of B robots, in D dimensions.

@@ -174,7 +174,7 @@ class MazeEnv(gym.Env):
         clearance = self._swept_ball.path_clearance(np.array(path))
         time, self._n_steps = self._time, self._n_steps + 1
         disc_clearance = self._disc_clearance(path, time, self._time)
-        had_collision = self._collisions or self._disc_collisions
+        had_collision = bool(self._collisions or self._disc_collisions)
         if clearance < 0:
             self._collisions.append(path[-1])
         if disc_clearance < 0:
