@@ -17,14 +17,14 @@ FLOORS = (
     ("policies",),
     ("dataset_tools", "hub"),
     ("envs", "results", "guidance"),
-    ("potential_field", "training"),
+    ("potential_field", "obstacle_field", "training"),
     ("flow_matching", "density", "process", "errors"),
     ("_autodiscover",),
 )
 FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 PACKAGE = Path(lerobot_pf2mp.__file__).parent
 TOOLS = Path(lerobot_pf2mp.dataset_tools.__file__).parent
-TORCH_ALONE = ("potential_field", "flow_matching", "guidance", "density")
+TORCH_ALONE = ("potential_field", "obstacle_field", "flow_matching", "guidance", "density")
 # The registration imports what registers, when LeRobot is imported; `lerobot_pf2mp/__init__.py` what it exports.
 ABOVE_ALL = (PACKAGE / "__init__.py", PACKAGE / "_autodiscover/registration.py")
 

@@ -101,8 +101,8 @@ def test_other_columns_are_an_error_that_names_those_there_should_be(tmp_path: P
 
 
 PLAN_COLUMNS = {
-    EpisodeRow: ["plans_drawn", "n_plans", "plan_flagged"],
-    SummaryRow: ["plans_drawn", "n_plans", "flagged", "flagged_collisions"],
+    EpisodeRow: ["plans_drawn", "n_plans", "plan_flagged", "obstacle_collision"],
+    SummaryRow: ["plans_drawn", "n_plans", "flagged", "flagged_collisions", "obstacle_collisions"],
 }
 
 

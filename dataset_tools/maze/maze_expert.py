@@ -4,20 +4,18 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Iterator
 
 import numpy as np
 
 from lerobot_pf2mp.dataset_tools.writing.episodes import Trajectory
 from lerobot_pf2mp.envs.maze.point_maze import make_point_maze, step_physics
+from lerobot_pf2mp.envs.maze.shortest_path import Cell, shortest_path
 
 WAYPOINT_RADIUS = 0.1  # within this distance a waypoint counts as reached, as in D4RL [m]
 WAYPOINT_JITTER = 0.1  # largest distance of waypoints to the cell centres, on each axis [m]
 GOAL_JITTER = 0.25  # the same for goals and starts, as in PointMaze [m]
 MAX_PHYSICS_STEPS = 3000  # [0.01 s]
-
-Cell = tuple[int, int]
 
 
 class MazeExpert:
@@ -67,7 +65,9 @@ class MazeExpert:
 
     def _drive(self, start: Cell, cell: Cell, goal: np.ndarray) -> list[list[float]] | None:
         """The positions of the ball until it reaches the goal [m]; None after a collision."""
-        waypoints = [self._off_centre(c, WAYPOINT_JITTER) for c in self._shortest_path(start, cell)[1:-1]]
+        waypoints = [
+            self._off_centre(c, WAYPOINT_JITTER) for c in shortest_path(self._is_free, start, cell)[1:-1]
+        ]
         positions = [self._position().tolist()]
         model, data = self._env.model, self._env.data
         for waypoint in [*waypoints, goal]:
@@ -80,21 +80,6 @@ class MazeExpert:
                 if data.ncon > self._n_ground_contacts or len(positions) > MAX_PHYSICS_STEPS:
                     return None
         return positions
-
-    def _shortest_path(self, start: Cell, goal: Cell) -> list[Cell]:
-        """The shortest path, by breadth-first search from the goal. So paths to one goal coincide after they meet."""
-        towards: dict[Cell, Cell] = {goal: goal}
-        queue = deque([goal])
-        while start not in towards:
-            i, j = queue.popleft()
-            for neighbour in ((i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)):
-                if neighbour in self._is_free and neighbour not in towards:
-                    towards[neighbour] = (i, j)
-                    queue.append(neighbour)
-        path = [start]
-        while path[-1] != goal:
-            path.append(towards[path[-1]])
-        return path
 
     def _off_centre(self, cell: Cell, jitter: float) -> np.ndarray:
         return self._maze.cell_rowcol_to_xy(np.array(cell)) + self._rng.uniform(-jitter, jitter, size=2)

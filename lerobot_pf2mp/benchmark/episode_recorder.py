@@ -18,6 +18,7 @@ from lerobot_pf2mp.benchmark.executed_plans import ExecutedPlans
 # The keys of an environment's info that are recorded, and how the values of all steps are combined.
 _OVER_STEPS: dict[str, Callable[[float, float], float]] = {
     "is_collision": max,
+    "is_obstacle_collision": max,
     "is_plan_in_wall": max,
     "clearance": min,
     "path_length": max,
@@ -42,6 +43,7 @@ class Episode:
         plans_drawn: Plans that the policy drew; None if it does not say.
         n_plans: Plans of which actions were executed; None in the same case.
         plan_flagged: Whether one of those still left the demonstrated region; None in the same case.
+        obstacle_collision: Whether there was a collision with an obstacle that the demonstrations did not have.
     """
 
     collision: bool | None
@@ -53,6 +55,7 @@ class Episode:
     plans_drawn: int | None = None
     n_plans: int | None = None
     plan_flagged: bool | None = None
+    obstacle_collision: bool | None = None
 
 
 class EpisodeRecorder(gym.vector.VectorWrapper):
@@ -137,6 +140,7 @@ class EpisodeRecorder(gym.vector.VectorWrapper):
                     plans_drawn=_int_or_none(reported.get("plans_drawn")),
                     n_plans=_int_or_none(reported.get("n_plans")),
                     plan_flagged=_bool_or_none(reported.get("is_plan_flagged")),
+                    obstacle_collision=_bool_or_none(reported.get("is_obstacle_collision")),
                 )
             )
         self._steps[:] = 0

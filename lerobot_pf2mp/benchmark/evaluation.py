@@ -118,6 +118,7 @@ class _Evaluator:
                 plans_drawn=episode.plans_drawn,
                 n_plans=episode.n_plans,
                 plan_flagged=episode.plan_flagged,
+                obstacle_collision=episode.obstacle_collision,
             )
             for number, (outcome, episode) in enumerate(zip(outcomes, episodes, strict=True))
         ]

@@ -30,4 +30,5 @@ def make_observed_env(env_class: str, obs_type: str = "state", **kwargs: Any) ->
     if obs_type == "state":
         return make_env(**kwargs)
     env = make_env(**{**kwargs, "render_mode": "rgb_array"})
-    return FilterObservation(AddRenderObservation(env, render_only=False), ["agent_pos", "pixels"])
+    kept = [key for key in ("agent_pos", "obstacles") if key in env.observation_space.spaces]
+    return FilterObservation(AddRenderObservation(env, render_only=False), [*kept, "pixels"])

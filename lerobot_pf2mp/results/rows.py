@@ -45,6 +45,8 @@ class EpisodeRow:
         plans_drawn: Plans that the policy drew in the episode; None, as for the next two, if they were not measured.
         n_plans: Plans (chunks) of which actions were executed.
         plan_flagged: Whether one of those still left the demonstrated region.
+        obstacle_collision: Whether there was a collision with an obstacle that the demonstrations did not have; None
+            without such obstacles.
     """
 
     task: str
@@ -69,6 +71,7 @@ class EpisodeRow:
     plans_drawn: int | None = None
     n_plans: int | None = None
     plan_flagged: bool | None = None
+    obstacle_collision: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,8 @@ class SummaryRow:
         n_plans: Plans executed in all episodes.
         flagged: Episodes in which a plan was executed that left the demonstrated region.
         flagged_collisions: Those of them with a collision; None also if the environment does not report them.
+        obstacle_collisions: Episodes with a collision with an obstacle that the demonstrations did not have; None without
+            such obstacles.
     """
 
     task: str
@@ -126,6 +131,7 @@ class SummaryRow:
     n_plans: int | None = None
     flagged: int | None = None
     flagged_collisions: int | None = None
+    obstacle_collisions: int | None = None
 
 
 def write_rows(path: Path, rows: Sequence[EpisodeRow] | Sequence[SummaryRow], row_type: type) -> None:

@@ -74,6 +74,7 @@ def _summarise_repeat(
         n_plans=_sum_or_none([row.n_plans for row in episodes]),
         flagged=_count_or_none([row.plan_flagged for row in episodes]),
         flagged_collisions=_count_or_none([_is_flagged_collision(row) for row in episodes]),
+        obstacle_collisions=_count_or_none([row.obstacle_collision for row in episodes]),
     )
 
 
@@ -123,6 +124,11 @@ class Cell:
     def collision(self) -> Rate | None:
         """The rate of episodes with a collision; None if the environment does not report it."""
         return self._rate_if_reported([row.collisions for row in self.repeats])
+
+    @property
+    def obstacle_collision(self) -> Rate | None:
+        """The rate of episodes that hit an obstacle which the demonstrations did not have; None without such obstacles."""
+        return self._rate_if_reported([row.obstacle_collisions for row in self.repeats])
 
     @property
     def plan_in_wall(self) -> Rate | None:

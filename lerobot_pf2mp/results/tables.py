@@ -20,6 +20,7 @@ _COLUMNS: dict[str, Callable[[Cell], str]] = {
     "collision rate [%]": lambda cell: _rate(cell, cell.collision, "collisions"),
     "95 % interval": lambda cell: _interval(cell.collision),
     "p (McNemar)": lambda cell: _p_value(cell.mcnemar_p),
+    "obstacle hit [%]": lambda cell: _with_interval(cell.obstacle_collision),
     "plans in the wall [%]": lambda cell: _rate(cell, cell.plan_in_wall, "plans_in_wall"),
     "success rate [%]": lambda cell: _rate(cell, cell.success, "successes"),
     "stroke error [mm]": lambda cell: _number(cell.stroke_error),
@@ -33,6 +34,7 @@ _COLUMNS: dict[str, Callable[[Cell], str]] = {
 # Columns that are left out if no cell has something to show there.
 _OPTIONAL = (
     "variant",
+    "obstacle hit [%]",
     "plans in the wall [%]",
     "stroke error [mm]",
     "plans",

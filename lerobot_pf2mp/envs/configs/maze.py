@@ -28,6 +28,8 @@ class PF2MPMazeEnv(CollisionEnvConfig):
         collision_radius: Radius around the ball's centre that must not touch a wall [m]: 0.1 is the whole ball, 0 only the
             centre.
         terminate_on_success: Whether an episode ends at the goal and not only after `episode_length` steps.
+        n_obstacles: Discs on the way, which the demonstrations did not have; a policy sees them as observation.obstacles.
+        obstacle_speed: Their speed across the corridor [m/s].
         render_size: Longer side of the rendered image [pixels].
     """
 
@@ -38,6 +40,8 @@ class PF2MPMazeEnv(CollisionEnvConfig):
     control: str = "exact"
     collision_radius: float = 0.1
     terminate_on_success: bool = False
+    n_obstacles: int = 0
+    obstacle_speed: float = 0.0
     render_size: int = 480
 
     def __post_init__(self) -> None:
@@ -71,6 +75,8 @@ class PF2MPMazeEnv(CollisionEnvConfig):
             "render_mode": "rgb_array",
             "render_size": self.render_size,
         }
+        if self.n_obstacles:
+            kwargs |= {"n_obstacles": self.n_obstacles, "obstacle_speed": self.obstacle_speed}
         if self.maze_map is not None:
             kwargs["maze_map"] = self.maze_map
         return kwargs

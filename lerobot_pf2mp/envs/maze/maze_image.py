@@ -15,6 +15,7 @@ BALL = (46, 139, 87)
 GOAL = (214, 39, 40)
 PATH = (31, 119, 180)
 COLLISION = (200, 20, 20)
+DISC = (70, 70, 78)
 
 _SUPERSAMPLING = 2  # because Pillow does not smooth lines
 
@@ -56,6 +57,8 @@ class MazeImage:
         goal: np.ndarray,
         path: Sequence[np.ndarray],
         collisions: Sequence[np.ndarray],
+        discs: Sequence[np.ndarray] = (),
+        disc_radius: float = 0.0,
     ) -> np.ndarray:
         """Draws the image, ``(H, W, 3)`` uint8.
 
@@ -64,10 +67,14 @@ class MazeImage:
             goal: ``(2,)`` position of the goal [m].
             path: Positions so far [m].
             collisions: Positions at which the ball collided [m].
+            discs: Centres of obstacles in the corridors [m].
+            disc_radius: Their radius [m].
         """
         image = self._background.copy()
         draw = ImageDraw.Draw(image)
         self._disc(draw, goal, 0.2, GOAL)
+        for centre in discs:
+            self._disc(draw, centre, disc_radius, DISC)
         if len(path) > 1:
             draw.line(
                 [self._pixel(p) for p in path], fill=PATH, width=round(0.06 * self._zoom), joint="curve"

@@ -24,6 +24,7 @@ from lerobot_pf2mp.policies.guarded.generation import KNOWN_AT_THE_END, AtTheEnd
 from lerobot_pf2mp.policies.guarded.repeated_rows import repeated_queues, repeated_rows
 from lerobot_pf2mp.policies.guided.field_guidance import FieldGuidance
 from lerobot_pf2mp.policies.guided.integrated_actions import guide_for_rows
+from lerobot_pf2mp.policies.obstacles.known_obstacles import OBS_OBSTACLES
 from lerobot_pf2mp.policies.own_policy import OwnPolicy
 from lerobot_pf2mp.policies.plans.plans import Plans
 
@@ -268,13 +269,13 @@ class GuardedPolicy(OwnPolicy, PreTrainedPolicy):
             return
         name = _CHUNK_METHODS.get(self.config.base_config.type, "predict_action_chunk")
         generate = getattr(self.base, name)
-        field = {key: value for key, value in batch.items() if key == POTENTIAL_FIELD}
+        ours = {key: value for key, value in batch.items() if key in (POTENTIAL_FIELD, OBS_OBSTACLES)}
 
         def planned(inputs: dict[str, Any], *args: Any, **kwargs: Any) -> Tensor:
             self._has_planned = True
             self._selecting = generate, self.config.n_action_steps
             try:
-                return self.predict_action_chunk({**inputs, **field}, *args, **kwargs)
+                return self.predict_action_chunk({**inputs, **ours}, *args, **kwargs)
             finally:
                 self._selecting = None
 

@@ -9,6 +9,7 @@ from lerobot.configs import PolicyFeature
 
 from lerobot_pf2mp.guidance import GuidanceSettings
 from lerobot_pf2mp.policies.guided.field_settings import INTEGRATED, FieldSettings
+from lerobot_pf2mp.policies.obstacles.obstacle_options import ObstacleOptions
 from lerobot_pf2mp.policies.plans.plans import ON_UNSUPPORTED
 
 # Policies read their settings for every chunk. The caches create and validate equal settings only once.
@@ -17,7 +18,7 @@ _guidance_settings = lru_cache(maxsize=64)(GuidanceSettings)
 
 
 @dataclass
-class GuidedConfig:
+class GuidedConfig(ObstacleOptions):
     """The options of guidance (Section IV-B of the paper), to be mixed into the configuration of a policy.
 
     The field is a density over actions, so the actions it covers must be positions in the space that holds the
@@ -25,7 +26,8 @@ class GuidedConfig:
     one over their running sum (`field_over`).
 
     All values can be changed at evaluation, for example with ``--policy.guidance_scale=0.4``. Only `field_action_dims`,
-    `field_over` and what belongs to it then need a new training, or pf2mp-fit-field.
+    `field_over` and what belongs to it then need a new training, or pf2mp-fit-field. The options of obstacles that the
+    demonstrations did not know are those of `ObstacleOptions`.
 
     Args:
         guidance_scale: lambda, the strength of the guidance; 0 with max_plans=1 is exactly the unguided policy.
@@ -129,6 +131,7 @@ class GuidedConfig:
             raise ValueError(f"max_plans must be at least 1, got {self.max_plans}")
         if not 0 < self.false_alarm_rate < 1:
             raise ValueError(f"false_alarm_rate must lie between 0 and 1, got {self.false_alarm_rate}")
+        self._validate_obstacles()
         # They validate their own values. Not from the caches, which take hashable values only.
         GuidanceSettings(self.guidance_scale, self.guidance_integrator, self.guidance_point)
         FieldSettings(*self._field_values)

@@ -16,6 +16,7 @@ from lerobot_pf2mp.policies.guided.field_state import ANCHOR, OUTLYING, SAFE_ANC
 from lerobot_pf2mp.policies.guided.fitted_sample import FittedSample, fit_sample, judge_sample
 from lerobot_pf2mp.policies.guided.integrated_actions import Integration
 from lerobot_pf2mp.policies.guided.recorded_angles import RecordedAngles
+from lerobot_pf2mp.policies.obstacles.recorded_units import RecordedUnits
 from lerobot_pf2mp.policies.plans.calibration import PlanCalibration
 from lerobot_pf2mp.policies.plans.demonstrated_plans import DemonstratedPlans
 from lerobot_pf2mp.policies.plans.plan_threshold import PlanThreshold
@@ -35,6 +36,8 @@ class DemonstratedActions:
 
     def __init__(self, settings: FieldSettings) -> None:
         self.settings = settings
+        # Of the preprocessor that holds them; None until it has been called.
+        self.recorded_units: RecordedUnits | None = None
         self._angles = RecordedAngles()
         self._start_afresh(dataset_id=b"")
 

@@ -31,7 +31,9 @@ from lerobot_pf2mp.policies.guided.integrated_actions import (
     Integration,
     observe_integrated,
 )
-from lerobot_pf2mp.policies.plans.plan_choice import DrawMore, PlanCheck, choose_plans, react
+from lerobot_pf2mp.policies.obstacles.known_obstacles import OBS_OBSTACLES, known_obstacles
+from lerobot_pf2mp.policies.obstacles.obstacle_guidance import ObstacleCheck, ObstacleGuidance
+from lerobot_pf2mp.policies.plans.plan_choice import DrawMore, PlanCheck, WayCheck, choose_plans, react
 from lerobot_pf2mp.policies.plans.plans import Plans, require_finite
 from lerobot_pf2mp.policies.plans.robot_places import RobotPlaces, seen_place
 from lerobot_pf2mp.potential_field import PotentialField
@@ -269,7 +271,8 @@ class FieldGuidance:
         config = self.config
         is_checked = config.checks_plans or self.measures_plans
         is_asked_for = config.on_unsupported != "ignore" or self.measures_plans
-        if torch.compiler.is_compiling() and POTENTIAL_FIELD not in batch and not is_asked_for:
+        is_free = not config.obstacles and OBS_OBSTACLES not in batch
+        if torch.compiler.is_compiling() and POTENTIAL_FIELD not in batch and not is_asked_for and is_free:
             return require_finite(chunk, batch)  # one graph, for a guide that the caller made
         robots = self._integrated(batch) if is_checked or config.guidance_scale else None
         if robots is None:
@@ -295,6 +298,10 @@ class FieldGuidance:
             some = robots.for_rows(rows, n_each)
             return some.positions(limited(some, draw_more(rows, n_each)))
 
+        if self.config.obstacle_rule != "ignore" and (self.config.obstacles or OBS_OBSTACLES in batch):
+            raise ValueError(
+                "obstacles need actions that are positions, got field_over=integrated: use obstacle_rule=ignore"
+            )
         require_finite(chunk, batch)
         chunk = limited(robots, chunk)
         proposed = robots.positions(chunk)
@@ -315,7 +322,11 @@ class FieldGuidance:
         """As `choose`, with places ``(B, A)`` where the robots are known to be; None if that is to be found out."""
         require_finite(chunk, batch)
         self.plans, observed, places = None, places, None
-        check = self._plan_check(batch, chunk) if is_checked else None
+        check: WayCheck | None = self._plan_check(batch, chunk) if is_checked else None
+        obstacles = self._known_obstacles(batch, chunk)
+        if obstacles is not None and self.config.obstacle_rule == "pass":
+            chunk, draw_more = obstacles.finished(chunk), obstacles.drawn_past(draw_more)
+            check = ObstacleCheck(obstacles, check) if is_checked else None
         if check is not None:
             config, robots = self.config, self._robots
             known = self._places_of_robots(batch, chunk) if observed is None else observed
@@ -327,7 +338,11 @@ class FieldGuidance:
             )
             if bool((self.plans.n_drawn > 1).any()):
                 robots.budget.took(time.perf_counter() - began)
+            if isinstance(check, ObstacleCheck):
+                self.plans = replace(self.plans, clearance=check.guidance.clearances(chunk))
             chunk = react(config.on_unsupported, self.plans, chunk, known, robots.n_steps or 0)
+        if obstacles is not None and self.config.obstacle_rule == "project":
+            chunk = obstacles.projected(chunk)
         self._robots.end(chunk, places)
         return chunk
 
@@ -359,6 +374,36 @@ class FieldGuidance:
         if message not in self._said:
             self._said.add(message)
             logger.warning(message, *arguments)
+
+    def _known_obstacles(self, batch: dict[str, Any], chunk: Tensor) -> ObstacleGuidance | None:
+        """What is done about obstacles in this call; None if none is known, or they are ignored."""
+        config = self.config
+        if not config.obstacles and OBS_OBSTACLES not in batch:
+            return None
+        dims, action_dim = config.field_settings.action_dims, config.action_feature.shape[0]
+        obstacles = known_obstacles(config, batch, action_dim if dims is None else len(dims))
+        if obstacles is None:
+            return None
+        units = getattr(batch.get(POTENTIAL_FIELD), "recorded_units", None)
+        if units is None:
+            raise ValueError(
+                "obstacles need the units of the recorded actions, which the policy's own preprocessor knows; got a batch "
+                "without it, or a normalisation of actions that is not one to one. obstacle_rule=ignore leaves them out"
+            )
+        units = units.on(dims, chunk.device)
+        places = self._places_of_robots(batch, chunk)
+        if places is not None:
+            places = units.recorded(places if dims is None else places[:, list(dims)])
+        guiding = config.guidance_scale > 0
+        return ObstacleGuidance(
+            config,
+            obstacles.to(chunk.device),
+            units,
+            dims,
+            places,
+            fitted_field(batch.get(POTENTIAL_FIELD), config, chunk.device) if guiding else None,
+            n_committed=self._robots.n_steps or 0,
+        )
 
     def _places_of_robots(self, batch: dict[str, Any], chunk: Tensor) -> Tensor | None:
         """Where the robots are when they begin to execute a chunk, as actions ``(B, A)`` [normalised]; None if unknown.

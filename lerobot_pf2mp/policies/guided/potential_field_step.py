@@ -32,6 +32,7 @@ from lerobot_pf2mp.policies.batch_keys import POTENTIAL_FIELD
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
 from lerobot_pf2mp.policies.guided.field_settings import FieldSettings
 from lerobot_pf2mp.policies.guided.relative_actions import refuse_relative_actions_beside
+from lerobot_pf2mp.policies.obstacles.recorded_units import units_beside
 
 
 @ProcessorStepRegistry.register("potential_field")
@@ -54,6 +55,7 @@ class PotentialFieldProcessorStep(ProcessorStep):
         """
         if not self._has_been_called:
             refuse_relative_actions_beside(self)
+            self.demonstrations.recorded_units = units_beside(self)
             self._has_been_called = True
         transition = transition.copy()
         complementary_data = dict(transition.get(TransitionKey.COMPLEMENTARY_DATA) or {})

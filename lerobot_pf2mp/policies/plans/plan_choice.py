@@ -7,6 +7,7 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -19,6 +20,16 @@ logger = logging.getLogger(__name__)
 
 # Draws n plans for each of some robots: maps ``(F,)`` their rows and n to ``(F n, T, A)``.
 DrawMore = Callable[[Tensor, int], Tensor]
+
+
+class WayCheck(Protocol):
+    """Judges the ways of plans."""
+
+    def __call__(self, places: Tensor, chunks: Tensor) -> Tensor:
+        """The support ``(B, T)`` of each action, see `PlanCheck`."""
+
+    def of_rows(self, rows: Tensor, n_each: int) -> WayCheck:
+        """The check of `n_each` plans of some robots ``(F,)`` of the batch, one after the other."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,9 +69,13 @@ class PlanCheck:
         is_known = is_finite[:, 1:] & is_finite[:, :-1]
         return torch.where(is_known, density - self.log_threshold, -torch.inf)
 
+    def of_rows(self, rows: Tensor, n_each: int) -> PlanCheck:
+        """The same check, as the field is the same for all robots."""
+        return self
+
 
 def choose_plans(
-    check: PlanCheck, places: Tensor, chunk: Tensor, max_plans: int, draw_more: DrawMore | None
+    check: WayCheck, places: Tensor, chunk: Tensor, max_plans: int, draw_more: DrawMore | None
 ) -> tuple[Tensor, Plans]:
     """Chooses a plan for each robot: the first one whose whole way is supported, in the order in which they are drawn.
 
@@ -84,7 +99,7 @@ def choose_plans(
     if max_plans > 1 and draw_more is not None and bool(is_flagged.any()):
         rows, n_more = is_flagged.nonzero().squeeze(1), max_plans - 1
         others = draw_more(rows, n_more)  # (F n, T, A)
-        their_support = check(places[rows].repeat_interleave(n_more, dim=0), others)
+        their_support = check.of_rows(rows, n_more)(places[rows].repeat_interleave(n_more, dim=0), others)
         others, their_support = (
             torch.cat([first[rows].unsqueeze(1), more.unflatten(0, (len(rows), n_more))], dim=1)
             for first, more in ((chunk, others), (support, their_support))
@@ -119,12 +134,7 @@ def react(
     """
     if on_unsupported == "ignore" or not bool(plans.is_flagged.any()):
         return chunk
-    n_flagged, n_plans = int(plans.is_flagged.sum()), len(plans.is_flagged)
-    what = "The plan leaves" if n_plans == 1 else f"{n_flagged} of {n_plans} plans leave"
-    message = (
-        f"{what} the demonstrated region by up to {-plans.support.min().item():.1f} nats, the best of "
-        f"{int(plans.n_drawn.max())} drawn"
-    )
+    message = f"{_what_is_wrong(plans)}, the best of {int(plans.n_drawn.max())} drawn"
     if on_unsupported == "stop":
         raise UnsupportedPlanError(f"{message}; nothing of it is executed (on_unsupported=stop)")
     if places is None:
@@ -135,6 +145,19 @@ def react(
         places = chunk[:, 0]
     logger.warning(message)
     return chunk if on_unsupported == "warn" else hold(chunk, places, plans.action_support, n_committed)
+
+
+def _what_is_wrong(plans: Plans) -> str:
+    n_plans, said = len(plans.is_flagged), []
+    hits = torch.zeros_like(plans.is_flagged) if plans.clearance is None else plans.clearance.amin(dim=1) < 0
+    if plans.clearance is not None and bool(hits.any()):
+        what = "The plan comes" if n_plans == 1 else f"{int(hits.sum())} of {n_plans} plans come"
+        said.append(f"{what} too near an obstacle, by up to {-plans.clearance.min().item():.3g}")
+    leaves = plans.is_flagged & ~hits
+    if bool(leaves.any()):
+        what = "The plan leaves" if n_plans == 1 else f"{int(leaves.sum())} of {n_plans} plans leave"
+        said.append(f"{what} the demonstrated region by up to {-plans.support[leaves].min().item():.1f} nats")
+    return ", and ".join(said)
 
 
 def hold(chunk: Tensor, places: Tensor, action_support: Tensor, n_committed: int = 0) -> Tensor:

@@ -19,14 +19,18 @@ class Plans:
     Args:
         n_drawn: ``(B,)`` int64 plans drawn for each robot, at least 1.
         is_flagged: ``(B,)`` bool, whether the chosen plan still leaves the demonstrated region.
-        support: ``(B,)`` smallest log density on the way of the chosen plan, above the threshold for plans [nats].
+        support: ``(B,)`` smallest log density on the way of the chosen plan, above the threshold for plans [nats]. Of a way
+            too near an obstacle it is below -1e6.
         action_support: ``(B, T)`` the same for the piece of the way that leads to each action.
+        clearance: ``(B, T)`` the distance on each piece to the nearest obstacle, above the one that is checked for [units of
+            the dataset's actions]; None without known obstacles.
     """
 
     n_drawn: Tensor
     is_flagged: Tensor
     support: Tensor
     action_support: Tensor
+    clearance: Tensor | None = None
 
 
 class UnsupportedPlanError(RuntimeError):
