@@ -46,7 +46,7 @@ class OffscreenCamera:
         """An image ``(H, W, 3)`` uint8.
 
         Args:
-            data: The state of the model, always the same object.
+            data: A state of the model. Environments that share their model can share their camera.
             mark: Adds markers to the image.
 
         Raises:
@@ -55,6 +55,7 @@ class OffscreenCamera:
         with rendering():
             if self._viewer is None:
                 self._viewer = self._make_viewer(data)
+            self._viewer.data = data
             self._viewer.make_context_current()
             if mark is not None:
                 mark(self._viewer)

@@ -112,12 +112,6 @@ class FenceSimulation(SO101NexusMuJoCoBaseEnv):
         """
         return None if self.render_mode is None else self._film_camera.render(self.data)
 
-    def close(self) -> None:
-        """Frees the renderers."""
-        self._camera.close()
-        self._film_camera.close()
-        super().close()
-
     def _bodies(self) -> str:
         half = np.array(self.scene.wall_size) / 2
         wall = " ".join(str(length) for length in half)
