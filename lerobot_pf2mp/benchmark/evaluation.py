@@ -212,7 +212,7 @@ def _measure_latency(
     observation, _ = env.reset(
         seed=[episode_seed + i for i in range(env.num_envs)], options={NEW_ROLLOUT_OPTION: True}
     )
-    observation = preprocess_observation({key: value[:1] for key, value in observation.items()})
+    observation = preprocess_observation(_of_first(observation))
     observation = preprocessor(env_preprocessor({**observation, "task": [""]}))
     times = []
     for _ in range(_N_LATENCY_CALLS):
@@ -229,3 +229,10 @@ def _measure_latency(
 def _wait_for(policy: PreTrainedPolicy) -> None:
     if next(policy.parameters()).is_cuda:
         torch.cuda.synchronize()
+
+
+def _of_first(observation: dict[str, Any]) -> dict[str, Any]:
+    """The observation of the first of several environments; cameras are dictionaries of images."""
+    return {
+        key: _of_first(value) if isinstance(value, dict) else value[:1] for key, value in observation.items()
+    }
