@@ -43,7 +43,7 @@ from lerobot_pf2mp.results.rows import SummaryRow, read_rows
 
 COLUMNS = (
     "task,policy,guidance_integrator,guidance_scale,variant,seed,repeat,episode,success,collision,plan_in_wall,min_clearance_m,"
-    "path_length_m,stroke_error_mm,steps,chunk_latency_ms,checkpoint,commit,plans_drawn,n_plans,plan_flagged"
+    "path_length_m,stroke_error_mm,steps,chunk_latency_ms,checkpoint,commit,plans_drawn,n_plans,plan_flagged,obstacle_collision"
 )
 
 
@@ -603,7 +603,7 @@ def test_results_from_before_plans_were_counted_are_added_to(
     copied: Path, whole_spec: BenchmarkSpec, evaluations: list[float]
 ) -> None:
     lines = [line.split(",") for line in (copied / "episodes.csv").read_text().splitlines()]
-    old = "".join(",".join(line[:-3]) + "\n" for line in lines[: 1 + 2 * N_EPISODES])
+    old = "".join(",".join(line[:-4]) + "\n" for line in lines[: 1 + 2 * N_EPISODES])
     (copied / "episodes.csv").write_text(old)
     rows = run(whole_spec, copied)
     assert len(evaluations) == 4
