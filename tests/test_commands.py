@@ -102,7 +102,7 @@ def test_unknown_options_end_with_the_usage_and_nothing_written(tmp_path: Path) 
                 "relative to the largest force (100 N)",
                 "by default 80 for a maze, 48 for Fetch",
                 "by default 4000 for a maze, 1000 for Fetch",
-                "handwriting_joint or handwriting_pen.",
+                "metaworld_pick_place_wall or so101_fence.",
                 "x, y of the wall's centre [m]",
                 "Width of these images, for a maze their longer side [pixels]",
             ],
@@ -184,7 +184,8 @@ def test_ctrl_c_and_sigterm_in_the_middle_of_collecting_leave_nothing_behind(
         (
             ["--task=kitchen"],
             "error: task must be one of ['maze_umaze', 'maze_medium', 'maze_large', 'fetch_reach', 'fetch_push', "
-            "'handwriting_joint', 'handwriting_pen'], got",
+            "'handwriting_joint', 'handwriting_pen', 'metaworld_reach_wall', 'metaworld_push_wall', "
+            "'metaworld_pick_place_wall', 'so101_fence'], got",
         ),
         (["--n_episodes=0"], "error: n_episodes must be at least 1, got 0"),
         (["--n_episodes=-5"], "error: n_episodes must be at least 1, got -5"),

@@ -1115,7 +1115,7 @@ def test_a_scene_file_may_be_given_below_the_home_folder(
                 "Examples: pf2mp-collect --",
                 "pf2mp-collect --task=handwriting_joint --letter=S",
                 "pf2mp-collect --task=handwriting_pen --scene_file=",
-                "handwriting_joint or handwriting_pen",
+                "metaworld_pick_place_wall or so101_fence",
                 "20 for handwriting_joint, 10 for handwriting_pen",
                 "64 for handwriting",
             ],

@@ -293,5 +293,5 @@ def test_datasets_that_are_not_numeric_do_not_fit_and_are_an_error(tmp_path, fea
         root=tmp_path / "other",
     )
     assert not fits_in_memory(dataset, 1e12)
-    with pytest.raises(ValueError, match="an in-memory dataset must be numeric"):
+    with pytest.raises(ValueError, match="an in-memory dataset must have numeric features"):
         InMemoryDataset(dataset)

@@ -184,7 +184,16 @@ def test_guidance_scale_zero_on_the_command_line_is_fmp(
         k: v
         for k, v in config.items()
         if not k.startswith(
-            ("guidance_", "field_", "n_field_", "max_plans", "false_alarm_rate", "on_unsupported")
+            (
+                "guidance_",
+                "field_",
+                "n_field_",
+                "max_plans",
+                "false_alarm_rate",
+                "on_unsupported",
+                "obstacle",
+                "robot_radius",
+            )
         )
     }
     (as_fmp / "config.json").write_text(json.dumps({**kept, "type": "fmp"}))
