@@ -240,7 +240,7 @@ def test_plans_flagged_episodes_and_collisions_among_them_are_counted() -> None:
     (silent,) = summarise([replace(row, collision=None) for row in rows])
     assert (silent.flagged, silent.flagged_collisions) == (3, None)
     (unmeasured,) = summarise(episodes([True, False]))
-    assert [getattr(unmeasured, name) for name in PLAN_COLUMNS[SummaryRow]] == [None] * 4
+    assert [getattr(unmeasured, name) for name in PLAN_COLUMNS[SummaryRow]] == [None] * 5
 
 
 # Twins
