@@ -31,7 +31,8 @@ def check_registrations():
     from lerobot.processor import ProcessorStepRegistry
     import gymnasium
     assert {{"fmp", "pf2mp", "dppf"}} <= set(PreTrainedConfig.get_known_choices())
-    assert {{"pf2mp_maze", "pf2mp_fetch", "pf2mp_handwriting", "pf2mp_metaworld", "pf2mp_so101"}} <= set(EnvConfig.get_known_choices())
+    ours = {{"pf2mp_maze", "pf2mp_fetch", "pf2mp_handwriting", "pf2mp_metaworld", "pf2mp_so101"}}
+    assert ours <= set(EnvConfig.get_known_choices())
     assert "fused_adamw" in OptimizerConfig.get_known_choices()
     assert "potential_field" in ProcessorStepRegistry.list()
     assert len([name for name in gymnasium.registry if name.startswith("lerobot_pf2mp/")]) == 12
