@@ -19,7 +19,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_pf2mp.errors import explained
 from lerobot_pf2mp.policies.guided.configuration_guided import GuidedConfig
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
-from lerobot_pf2mp.policies.guided.field_guidance import fitted_field
+from lerobot_pf2mp.policies.guided.fitted_field import fitted_field
 from lerobot_pf2mp.policies.guided.potential_field_step import PotentialFieldProcessorStep
 from lerobot_pf2mp.policies.guided.relative_actions import refuse_relative_actions
 from lerobot_pf2mp.policies.processor_files import check_processors, trusting

@@ -18,7 +18,7 @@ from harness import Row, ratio, threads, time_in_turns
 from maze_policies import HORIZON, NAMES, PAPER, SMALL, Planner, make_planner, replay
 
 from lerobot_pf2mp.policies.batch_keys import POTENTIAL_FIELD
-from lerobot_pf2mp.policies.guided.field_guidance import fitted_field
+from lerobot_pf2mp.policies.guided.fitted_field import fitted_field
 from lerobot_pf2mp.potential_field import PotentialField
 
 BATCH_SIZES = (1, 64)

@@ -1,35 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
 """The part of a guided policy that uses the potential field.
 
-It adds the actions of training batches to the field, makes the guide from the field, and chooses plans with it.
+It makes the guide from the field, and chooses plans with it; what training adds to the field is in `field_observer`.
 """
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
-import numpy as np
 import torch
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
 from lerobot_pf2mp.flow_matching import Guide
 from lerobot_pf2mp.guidance import GuidanceSettings, make_guide
-from lerobot_pf2mp.policies.batch_keys import ACTION_IS_PAD, POTENTIAL_FIELD
-from lerobot_pf2mp.policies.guided.action_kind import warn_about_actions
-from lerobot_pf2mp.policies.guided.action_units import normalised_unit, normaliser_of, places_of_states
+from lerobot_pf2mp.policies.batch_keys import POTENTIAL_FIELD
 from lerobot_pf2mp.policies.guided.demonstrated_actions import DemonstratedActions
+from lerobot_pf2mp.policies.guided.field_observer import FieldObserver
 from lerobot_pf2mp.policies.guided.field_settings import INTEGRATED
+from lerobot_pf2mp.policies.guided.fitted_field import fitted_field
 from lerobot_pf2mp.policies.guided.integrated_actions import (
     IntegratedActions,
     IntegratedGuide,
-    Integration,
-    observe_integrated,
 )
 from lerobot_pf2mp.policies.obstacles.known_obstacles import OBS_OBSTACLES, known_obstacles
 from lerobot_pf2mp.policies.obstacles.obstacle_guidance import ObstacleCheck, ObstacleGuidance
@@ -37,15 +32,9 @@ from lerobot_pf2mp.policies.plans.plan_choice import DrawMore, PlanCheck, WayChe
 from lerobot_pf2mp.policies.plans.plans import Plans, require_finite
 from lerobot_pf2mp.policies.plans.robot_places import RobotPlaces, seen_place
 from lerobot_pf2mp.potential_field import PotentialField
-from lerobot_pf2mp.training.gathering import gather_rows, is_main_process
-from lerobot_pf2mp.training.run_dataset import find_dataset, run_episodes
 
 if TYPE_CHECKING:
-    from lerobot_pf2mp.policies.dppf.configuration_dppf import DPPFConfig
-    from lerobot_pf2mp.policies.guarded.configuration_guarded import GuardedConfig
-    from lerobot_pf2mp.policies.pf2mp.configuration_pf2mp import PF2MPConfig
-
-    type GuidedPolicyConfig = PF2MPConfig | DPPFConfig | GuardedConfig
+    from lerobot_pf2mp.policies.guided.fitted_field import GuidedPolicyConfig
 
 
 logger = logging.getLogger(__name__)
@@ -69,11 +58,7 @@ class FieldGuidance:
         dataset_meta: Any = None,
     ) -> None:
         self.config = config
-        self._dataset_id = _identify_dataset(dataset_stats, run_episodes(dataset_meta), config)
-        self._unit, self._places = _units_of(dataset_stats, config)
-        self._integration = _integration_of(dataset_stats, config)
-        self._unchecked_meta = dataset_meta  # until its dataset's actions have been looked at
-        self.demonstrations: DemonstratedActions | None = None  # those of the last training batch
+        self._observer = FieldObserver(config, dataset_stats, dataset_meta)
         # Whether plans are checked even if nothing acts on it: `plans` then tells of them.
         self.measures_plans = False
         self._said: set[str] = set()
@@ -82,7 +67,7 @@ class FieldGuidance:
 
     def __getstate__(self) -> dict[str, Any]:
         """The state for copies and pickles of the policy. A copy makes its own guide."""
-        return {**vars(self), "_made": None, "_unchecked_meta": None}
+        return {**vars(self), "_made": None}
 
     def reset(self) -> None:
         """Forgets the plans and actions of before. Must be called at the start of an episode."""
@@ -98,87 +83,14 @@ class FieldGuidance:
         """
         return None if self.plans is None else self.plans.action_support
 
+    @property
+    def demonstrations(self) -> DemonstratedActions | None:
+        """The demonstrated actions of the last training batch; None before the first one."""
+        return self._observer.demonstrations
+
     def observe(self, batch: dict[str, Any]) -> None:
-        """Adds the actions of a training batch to the field in that batch. A batch without a field changes nothing.
-
-        With several processes, the field of each process gets the batches of all, because only the main process saves its
-        field. They exchange B x (T x (4 A + 1) + 4 A + 16) bytes in every step, which is little compared with the gradients.
-
-        Args:
-            batch: A training batch that the policy's own preprocessor has made.
-        """
-        demonstrations = batch.get(POTENTIAL_FIELD)
-        if demonstrations is None:
-            return
-        self.demonstrations = demonstrations
-        if self._unchecked_meta is not None:
-            self._check_dataset()
-        is_integrated = self.config.field_over == INTEGRATED
-        states = batch.get(OBS_STATE)
-        if states is not None and states.ndim == 3:
-            states = states[:, -1]
-        has_places = self._places is not None and bool(self._places.numel())
-        actions, is_pad, frames, episodes, states = gather_rows(
-            batch[ACTION],
-            batch.get(ACTION_IS_PAD),
-            batch.get("index"),
-            batch.get("episode_index"),
-            states if is_integrated or has_places else None,
-        )
-        first = self.config.action_delta_indices[0]
-        if is_integrated:
-            self._observe_integrated(demonstrations, cast(Tensor, actions), is_pad, frames, episodes, states)
-            return
-        demonstrations.observe(
-            cast(Tensor, actions),
-            is_pad,
-            None if frames is None else frames + first,
-            episodes,
-            settings=self.config.field_settings,
-            unit=self._unit,
-            dataset_id=self._dataset_id,
-            n_past=-first,
-            n_executed=self.config.n_action_steps,
-            drop_n_last_frames=getattr(self.config, "drop_n_last_frames", 0) or 0,
-            states=states,
-            places=self._places,
-        )
-
-    def _observe_integrated(
-        self,
-        demonstrations: DemonstratedActions,
-        actions: Tensor,
-        is_pad: Tensor | None,
-        frames: Tensor | None,
-        episodes: Tensor | None,
-        states: Tensor | None,
-    ) -> None:
-        """Adds the positions to which the displacements of a training batch lead. Arguments as gathered by `observe`."""
-        if self._integration is None or states is None:
-            raise ValueError(
-                "field_over=integrated needs observation.state and the dataset's statistics in training, got a batch or a "
-                "policy without them"
-            )
-        observe_integrated(
-            demonstrations,
-            self._integration,
-            actions[:, -self.config.action_delta_indices[0] :],
-            None if is_pad is None else is_pad[:, -self.config.action_delta_indices[0] :],
-            frames,
-            episodes,
-            states,
-            settings=self.config.field_settings,
-            dataset_id=self._dataset_id,
-            n_executed=self.config.n_action_steps,
-            drop_n_last_frames=getattr(self.config, "drop_n_last_frames", 0) or 0,
-        )
-
-    @torch.compiler.disable
-    def _check_dataset(self) -> None:
-        """Warns if the field is over what the actions of the run's dataset are not. A streaming dataset is not looked at."""
-        dataset, self._unchecked_meta = find_dataset(self._unchecked_meta), None
-        if isinstance(dataset, LeRobotDataset) and is_main_process():
-            warn_about_actions(dataset, self.config.field_settings)
+        """Adds the actions of a training batch to the field in it, see `FieldObserver.observe`."""
+        self._observer.observe(batch)
 
     @torch.compiler.disable  # the field may have to be fitted first
     def guide(self, batch: dict[str, Any], device: torch.device) -> Guide | None:
@@ -431,78 +343,3 @@ class FieldGuidance:
         return seen_place(
             demonstrations.place_of(states.to(first)), first, self.config.field_settings.action_dims
         )
-
-
-def fitted_field(
-    demonstrations: object, config: GuidedPolicyConfig, device: torch.device | str = "cpu"
-) -> PotentialField:
-    """The potential field that guides a policy.
-
-    Args:
-        demonstrations: The object that the policy's preprocessor puts into a batch under `POTENTIAL_FIELD`.
-        config: The policy's configuration.
-        device: The device on which the field is used.
-
-    Raises:
-        ValueError: If there is no field, it is not fitted, or it covers other dimensions than the policy's.
-    """
-    if not isinstance(demonstrations, DemonstratedActions):
-        raise ValueError(
-            f"guidance needs the potential field, which the policy's own preprocessor puts under {POTENTIAL_FIELD!r}; "
-            "got a batch without it. Load the preprocessor from the checkpoint, or set guidance_scale=0, max_plans=1 and "
-            "on_unsupported=ignore"
-        )
-    field = demonstrations.field(config.field_settings, device)
-    dims = config.field_action_dims
-    n_dims = config.action_feature.shape[0] if dims is None else len(dims)
-    if field.dim != n_dims:
-        raise ValueError(
-            f"the potential field must cover {n_dims} action dimensions, got a field over {field.dim}: it belongs to "
-            "another policy"
-        )
-    return field
-
-
-def _units_of(
-    dataset_stats: dict[str, dict[str, Any]] | None, config: GuidedPolicyConfig
-) -> tuple[Tensor | None, Tensor | None]:
-    """The `normalised_unit` and `places_of_states` of a dataset; None at evaluation."""
-    if not dataset_stats or ACTION not in dataset_stats:
-        return None, None
-    normaliser, action_dim = normaliser_of(config, dataset_stats), config.action_feature.shape[0]
-    return normalised_unit(normaliser, action_dim), places_of_states(normaliser, action_dim)
-
-
-def _integration_of(
-    dataset_stats: dict[str, dict[str, Any]] | None, config: GuidedPolicyConfig
-) -> Integration | None:
-    """How displacements of a dataset become positions; None at evaluation, or for a field over actions."""
-    if config.field_over != INTEGRATED or not dataset_stats or ACTION not in dataset_stats:
-        return None
-    return Integration.of(
-        normaliser_of(config, dataset_stats),
-        config.field_settings,
-        config.action_feature.shape[0],
-        dataset_stats[ACTION],
-    )
-
-
-def _identify_dataset(
-    dataset_stats: dict[str, dict[str, Any]] | None, episodes: list[int] | None, config: GuidedPolicyConfig
-) -> bytes:
-    """A digest of the action statistics, their normalisation and the run's episodes.
-
-    LeRobot reloads the saved preprocessor both when a run resumes and when another run starts from a checkpoint. With the
-    same digest, the saved sample continues. With another digest, its points belong to other data or have other units, so a
-    new sample starts.
-    """
-    if not dataset_stats or ACTION not in dataset_stats:
-        return b""
-    digest = hashlib.sha256(str(config.normalization_mapping.get("ACTION")).encode())
-    keys = (ACTION, OBS_STATE) if config.field_over == INTEGRATED else (ACTION,)
-    for name, value in [item for key in keys for item in sorted(dataset_stats.get(key, {}).items())]:
-        digest.update(name.encode())
-        digest.update(np.asarray(value, dtype=np.float64).tobytes())
-    if episodes is not None:
-        digest.update(np.asarray(sorted(episodes), dtype=np.int64).tobytes())
-    return digest.digest()
