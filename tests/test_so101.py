@@ -115,9 +115,54 @@ class TestSimulation:
     def test_the_cube_laid_onto_the_goal_is_the_success(self, env: gym.Env) -> None:
         _, info = env.reset(seed=1, options={"cube": (0.22, 0.1), "goal": (0.24, -0.1)})
         assert not info["is_success"]
+        observation, _ = env.reset(seed=1, options={"cube": (0.22, 0.1), "goal": (0.24, -0.1)})
+        assert np.allclose(observation["environment_state"][3:], (0.24, -0.1))
         assert np.allclose(env.unwrapped._simulation.cube[:2], (0.22, 0.1), atol=1e-3)
         with pytest.raises(ValueError, match="goal must be"):
             env.reset(options={"goal": (0.5, 0.0)})
+
+    def test_a_cube_that_is_still_held_at_the_goal_is_no_success(self, env: gym.Env) -> None:
+        from lerobot_pf2mp.dataset_tools.so101.fence_expert import ScriptedFenceExpert
+
+        expert, simulation = ScriptedFenceExpert(env.unwrapped, "clear", seed=0), env.unwrapped._simulation
+        env.reset(seed=0)
+        seen = []
+        for action in expert._actions(np.random.default_rng(0)):
+            *_, info = env.step(action)
+            offset = simulation.cube - [*simulation.layout.goal, 0.0125]
+            is_there = np.hypot(*offset[:2]) < 0.03 and abs(offset[2]) < 0.01
+            seen.append((is_there, bool(simulation._is_grasping()), info["is_success"]))
+        assert (True, True, False) in seen
+        assert (True, False, True) in seen
+        assert all(success == (is_there and not held) for is_there, held, success in seen)
+
+    def test_a_touch_in_a_single_physics_step_is_a_collision(
+        self, env: gym.Env, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        env.reset(seed=0)
+        wall = env.unwrapped._simulation.wall
+        depths = iter([0.0, 0.0, 0.002, *[0.0] * 20])  # ten in a step
+        monkeypatch.setattr(wall, "contact_depth", lambda: next(depths))
+        observation, reward, _, _, info = env.step(env.unwrapped._observation()["agent_pos"])
+        assert (info["is_collision"], reward, info["clearance"]) == (True, -1.0, -0.002)
+        assert env.step(observation["agent_pos"])[1] == 0.0
+
+    def test_environments_that_share_their_model_and_camera_are_apart(self) -> None:
+        envs = [gym.make("lerobot_pf2mp/SO101Fence-v0", obs_type="pixels_agent_pos") for _ in range(2)]
+        places = [
+            {"cube": (0.20, 0.08), "goal": (0.27, -0.16)},
+            {"cube": (0.27, 0.16), "goal": (0.20, -0.08)},
+        ]
+        for env, place in zip(envs, places, strict=True):
+            env.reset(seed=0, options=place)
+        first, second = (env.step(env.unwrapped._observation()["agent_pos"])[0]["pixels"] for env in envs)
+        alone = gym.make("lerobot_pf2mp/SO101Fence-v0", obs_type="pixels_agent_pos")
+        alone.reset(seed=0, options=places[0])
+        again = alone.step(alone.unwrapped._observation()["agent_pos"])[0]["pixels"]
+        assert np.array_equal(first["front"], again["front"])
+        assert not np.array_equal(first["front"], second["front"])
+        for env in (*envs, alone):
+            env.close()
 
     @pytest.mark.parametrize("action", [np.zeros(5), np.full(6, np.nan)], ids=["too short", "nan"])
     def test_an_impossible_action_is_refused(self, env: gym.Env, action: np.ndarray) -> None:

@@ -26,7 +26,7 @@ class MetaWorldEnv(gym.Env):
 
     ## Description
     Meta-World's own environments (McLean et al., 2025), with one difference: contacts with the wall are reported. Actions
-    are displacements of the hand's target, which the hand follows with a lag of up to 10 cm. The target stays in a box: a
+    are displacements of the hand's target, which the hand follows with a lag of up to 11 cm. The target stays in a box: a
     displacement that leads out of it is cut.
 
     ## Action space
