@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from small_benchmarks import (
@@ -609,6 +610,14 @@ def test_results_from_before_plans_were_counted_are_added_to(
     assert len(evaluations) == 4
     assert [row.n_plans for row in rows] == [None] * (2 * N_EPISODES) + [N_CHUNKS] * (4 * N_EPISODES)
     assert (copied / "episodes.csv").read_text().splitlines()[0] == COLUMNS
+
+
+def test_the_first_observation_of_many_has_its_cameras() -> None:
+    pixels = {"front": np.arange(24).reshape(3, 2, 4), "wrist": np.zeros((3, 1))}
+    first = evaluation._of_first({"agent_pos": np.arange(6).reshape(3, 2), "pixels": pixels})
+    assert first["agent_pos"].tolist() == [[0, 1]]
+    assert first["pixels"]["front"].tolist() == [[[0, 1, 2, 3], [4, 5, 6, 7]]]
+    assert first["pixels"]["wrist"].shape == (1, 1)
 
 
 # The same for all

@@ -351,6 +351,15 @@ def test_a_copy_of_a_guidance_makes_its_own_guide():
     assert guidance.guide({POTENTIAL_FIELD: shown}, cpu) is kept
 
 
+def test_a_copy_of_a_guidance_leaves_the_dataset_behind():
+    class Meta:
+        def __deepcopy__(self, memo: object) -> None:
+            raise AssertionError("the metadata was copied")
+
+    copied = copy.deepcopy(FieldGuidance(config_of(), dataset_meta=Meta()))
+    assert copied.demonstrations is None
+
+
 def test_settings_are_validated_once_for_all_plans():
     config = config_of()
     assert config.guidance_settings is config.guidance_settings

@@ -184,6 +184,17 @@ def test_switched_off_it_is_the_unguided_policy_bit_for_bit(dataset, kind):
     assert policy.plans is not None
 
 
+def test_obstacles_are_refused_because_displacements_have_no_place_among_them(dataset):
+    ball = {"type": "ball", "centre": [0.5, 0.1], "radius": 0.1}
+    policy, pre, _ = trained(dataset, "pf2mp", obstacles=[ball])
+    with pytest.raises(
+        ValueError, match="obstacles need actions that are positions, got field_over=integrated"
+    ):
+        act(policy, pre)
+    policy.config.obstacle_rule = "ignore"
+    act(policy, pre)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_guidance_leads_to_places_that_are_better_supported(dataset, kind):
     policy, pre, _ = trained(dataset, kind, guidance_scale=0.0, max_plans=1)
